@@ -1,0 +1,1 @@
+"""Everything that touches a file: formats, names, paths and atomic writes."""

@@ -1,0 +1,104 @@
+"""Files and folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UserError
+
+
+def _disk_error(error: OSError, path: Path) -> UserError | None:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return UserError(
+            f"{path}: the disk is full.",
+            "Free some space and run again; older results are untouched.",
+        )
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return UserError(f"{path}: cannot be written ({error.strerror}).", "Check its permissions.")
+    return None
+
+
+@contextmanager
+def disk_faults(path: Path) -> Iterator[None]:
+    """Turns a full or read-only disk met while writing `path` into a UserError."""
+    try:
+        yield
+    except OSError as error:
+        fault = _disk_error(error, path)
+        if fault is None:
+            raise
+        raise fault from error
+
+
+@contextmanager
+def publish_dir(final: Path) -> Iterator[Path]:
+    """Yields a fresh folder beside `final`; on success it takes that name, on failure it is gone.
+
+    Leftovers of killed runs are cleared at the start. Whatever stood at `final` stays there until the
+    new folder is complete.
+    """
+    with disk_faults(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        for leftover in final.parent.glob(f".{final.name}.tmp-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        fresh = final.parent / f".{final.name}.tmp-{os.getpid()}"
+        fresh.mkdir()
+        try:
+            yield fresh
+            _swap(fresh, final)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _swap(fresh: Path, final: Path) -> None:
+    """Two renames, so that the old result survives until the new one can take its place."""
+    if not final.exists():
+        fresh.replace(final)
+        return
+    old = final.parent / f".{final.name}.tmp-old-{os.getpid()}"
+    final.replace(old)
+    fresh.replace(final)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `data` to `path`: beside it first, flushed to disk, then renamed."""
+    with disk_faults(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = path.parent / f".{path.name}.tmp-{os.getpid()}"
+        try:
+            with fresh.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(path)
+        finally:
+            fresh.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes UTF-8 `text` to `path`, whole or not at all."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes `content` as JSON with sorted keys; raises ValueError on NaN or infinity."""
+    write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, made_by: str = "") -> Any:
+    """The content of a JSON file; UserError when it is missing or damaged, naming the stage that makes it."""
+    hint = f"Run `python -m stages.{made_by}` first." if made_by else ""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist.", hint) from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is damaged: {error}.", hint.replace("first", "again")) from None

@@ -1,0 +1,137 @@
+"""Photographs in, 8-bit RGB PNG inside."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import write_bytes
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+MAX_PIXELS = 200_000_000
+# EXIF orientation -> degrees counter-clockwise that make the stored pixels upright. The mirrored codes
+# (2, 4, 5, 7) come from editing programs, not cameras; they are undone before the turn.
+_TURN = {1: 0, 2: 0, 3: 180, 4: 180, 5: 270, 6: 270, 7: 90, 8: 90}
+_MIRRORED = {2: 0, 4: 0, 5: 1, 7: 1}
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+
+
+@dataclass(frozen=True)
+class PhotoInfo:
+    """What a photo's metadata says: turn to be upright (degrees counter-clockwise), focal length (px)."""
+
+    upright_turn: int
+    focal_px: float | None
+
+
+def read_image(path: Path, made_by: str = "ingest") -> np.ndarray:
+    """An (H, W, 3) float32 RGB image in [0, 1] from a file that a stage wrote."""
+    if not path.is_file():
+        raise UserError(f"{path} does not exist.", f"Run `python -m stages.{made_by}` first.")
+    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise UserError(
+            f"{path} is not a readable image.", f"Run `python -m stages.{made_by}` again."
+        )
+    return pixels.astype(np.float32) / np.float32(255)
+
+
+def write_image(path: Path, rgb: np.ndarray) -> None:
+    """Writes an (H, W, 3) RGB image, float in [0, 1] (clipped, rounded) or uint8, as an 8-bit PNG."""
+    if rgb.dtype != np.uint8:
+        rgb = np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8)
+    done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise OSError(f"{path}: the image could not be encoded")
+    write_bytes(path, data.tobytes())
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of the stored pixels, read from the file's header."""
+    with Image.open(path) as photo:
+        return photo.size
+
+
+def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
+    """The stored pixels of a user's photo, (H, W, 3) uint8 RGB as the sensor saw them, and its metadata.
+
+    Grey, palette, RGBA (over black), CMYK and 16-bit files are converted to 8-bit RGB. UserError for what
+    is not an image, is cut short, or has more than MAX_PIXELS.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as photo:
+                if photo.width * photo.height > MAX_PIXELS:
+                    raise UserError(
+                        f"{path} has {photo.width}x{photo.height} pixels.",
+                        f"At most {MAX_PIXELS:,} are read; scale it down.",
+                    )
+                photo.load()
+                return _sensor_pixels(photo), _photo_info(photo)
+    except UserError:
+        raise
+    except UnidentifiedImageError:
+        raise UserError(
+            f"{path} is not an image that can be read.", "Remove it, or convert it to JPEG or PNG."
+        ) from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise UserError(
+            f"{path} is damaged or cut short ({error}).", "Copy it again, or remove it."
+        ) from None
+
+
+def _sensor_pixels(photo: Image.Image) -> np.ndarray:
+    if photo.mode.startswith(("I", "F")):
+        values = np.asarray(photo).astype(np.float64)
+        scale = 255.0 / 65535.0 if values.max() > 255 else 1.0
+        grey = np.rint(np.clip(values * scale, 0, 255)).astype(np.uint8)
+        pixels = np.repeat(grey[..., None], 3, axis=2)
+    else:
+        pixels = np.array(photo.convert("RGB"))
+    flip = _MIRRORED.get(_orientation(photo))
+    return pixels if flip is None else np.ascontiguousarray(np.flip(pixels, axis=1 - flip))
+
+
+def _orientation(photo: Image.Image) -> int:
+    code = photo.getexif().get(ExifTags.Base.Orientation, 1)
+    return code if code in _TURN else 1
+
+
+def _photo_info(photo: Image.Image) -> PhotoInfo:
+    exif = photo.getexif().get_ifd(ExifTags.IFD.Exif)
+    try:
+        equivalent = float(exif.get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+    except (TypeError, ValueError, ZeroDivisionError):
+        equivalent = 0.0
+    diagonal = math.hypot(*photo.size)
+    focal = (
+        equivalent / _DIAGONAL_35MM * diagonal
+        if math.isfinite(equivalent) and equivalent > 0
+        else None
+    )
+    return PhotoInfo(_TURN[_orientation(photo)], focal)
+
+
+def turn(pixels: np.ndarray, degrees: int) -> np.ndarray:
+    """`pixels` turned counter-clockwise by a multiple of 90 degrees, contiguous."""
+    if degrees % 90:
+        raise ValueError(f"a turn is a multiple of 90 degrees, got {degrees}")
+    return np.ascontiguousarray(np.rot90(pixels, (degrees // 90) % 4))
+
+
+def shrink(pixels: np.ndarray, longest_side: int) -> np.ndarray:
+    """`pixels` scaled down by area averaging until no side exceeds `longest_side`; never enlarged."""
+    height, width = pixels.shape[:2]
+    factor = longest_side / max(height, width)
+    if factor >= 1.0:
+        return pixels
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,114 @@
+"""Posed views as nerfstudio's transforms.json: the one door where camera conventions change.
+
+Inside the project `cam_from_world` maps to OpenCV axes (x right, y down, z forward). The file holds
+`transform_matrix`, the inverse with OpenGL axes (x right, y up, z backward), as nerfstudio reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import read_json, write_json
+
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed image: a pinhole with one radial term.
+
+    `cam_from_world` is (4, 4) float64, OpenCV axes. `fx, fy, cx, cy` are in pixels with pixel (0, 0)'s
+    centre at (0.5, 0.5). A point at normalised radius r lands at r (1 + k1 r^2). `near` and `far` bound
+    the depths of its sparse points, in world units.
+    """
+
+    name: str
+    cam_from_world: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    width: int
+    height: int
+    near: float
+    far: float
+
+    @property
+    def world_from_cam(self) -> np.ndarray:
+        """(4, 4) inverse of `cam_from_world`."""
+        return np.linalg.inv(self.cam_from_world)
+
+
+_NUMBERS = {
+    "fl_x": "fx",
+    "fl_y": "fy",
+    "cx": "cx",
+    "cy": "cy",
+    "k1": "k1",
+    "near": "near",
+    "far": "far",
+}
+
+
+def write_transforms(
+    path: Path, views: Iterable[View], extras: Mapping[str, Any] | None = None
+) -> None:
+    """Writes transforms.json with intrinsics, image and mask path per frame.
+
+    Paths are relative to the file's folder, which lies beside `images/` and `masks/`.
+    """
+    frames = [_frame(view) for view in sorted(views, key=lambda view: view.name)]
+    write_json(path, {"camera_model": "OPENCV", **(extras or {}), "frames": frames})
+
+
+def _frame(view: View) -> dict[str, Any]:
+    numbers = {key: round(float(getattr(view, field)), 10) for key, field in _NUMBERS.items()}
+    return numbers | {
+        "file_path": f"../images/{view.name}",
+        "mask_path": f"../masks/{view.name}",
+        "w": view.width,
+        "h": view.height,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "transform_matrix": np.round(view.world_from_cam @ GL_FROM_CV, 12).tolist(),
+    }
+
+
+def read_transforms(path: Path) -> dict[str, View]:
+    """The posed views by image name; UserError when missing, damaged or not rigid."""
+    content = read_json(path, made_by="poses")
+    try:
+        views = [_view(frame) for frame in content["frames"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a list of posed views ({error!r}).",
+            "Run `python -m stages.poses` again.",
+        ) from None
+    for view in views:
+        rotation = view.cam_from_world[:3, :3]
+        if (
+            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+            or np.linalg.det(rotation) < 0
+        ):
+            raise UserError(f"{path}: the pose of {view.name} is not a rotation and a translation.")
+    return {view.name: view for view in views}
+
+
+def _view(frame: Mapping[str, Any]) -> View:
+    world_from_gl = np.asarray(frame["transform_matrix"], np.float64).reshape(4, 4)
+    numbers = {field: float(frame[key]) for key, field in _NUMBERS.items()}
+    return View(
+        name=Path(frame["file_path"]).name,
+        cam_from_world=np.linalg.inv(world_from_gl @ GL_FROM_CV),
+        width=int(frame["w"]),
+        height=int(frame["h"]),
+        **numbers,
+    )

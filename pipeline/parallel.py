@@ -1,0 +1,109 @@
+"""One function over many named things: threads on this machine, or a running Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import cv2
+import dask
+from dask.callbacks import Callback
+from dask.delayed import Delayed, delayed
+from tqdm import tqdm
+
+from pipeline.errors import UserError
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def map_named(
+    function: Callable[..., Any],
+    items: Mapping[str, tuple[Any, ...]],
+    *,
+    job_label: str,
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> dict[str, Any]:
+    """`function(*items[name])` for every name, in the order of the names.
+
+    `function` lives in a module, takes paths and small values and returns small values; it runs
+    single-threaded, `workers` at a time (default: one per core). With `scheduler` (tcp://host:port) the
+    calls run on that Dask cluster, whose workers need the project installed and see the same folders.
+    The results do not depend on where they were computed. A failure names the item.
+    """
+    tasks = {
+        name: delayed(_call, pure=False)(
+            job_label, name, function, args, dask_key_name=f"{job_label}-{name}"
+        )
+        for name, args in sorted(items.items())
+    }
+    compute = _on_cluster if scheduler else _on_threads
+    return compute(tasks, job_label, scheduler or "", workers or cores())
+
+
+def _call(label: str, name: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    cv2.setNumThreads(1)
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.set_num_threads(1)
+    try:
+        return function(*args)
+    except UserError as error:
+        if name in error.what:
+            raise
+        raise UserError(f"{name}: {error.what}", error.hint) from error
+    except Exception as error:
+        raise RuntimeError(f"{label} failed on {name}: {error!r}") from error
+
+
+def _on_threads(tasks: dict[str, Delayed], label: str, _: str, workers: int) -> dict[str, Any]:
+    torch = sys.modules.get("torch")
+    threads = torch.get_num_threads() if torch is not None else 0
+    try:
+        with tqdm(total=len(tasks), desc=label, unit="image", leave=False) as bar:
+            with Callback(posttask=lambda *_: bar.update()):
+                how = {"scheduler": "threads", "num_workers": workers}
+                results = dask.compute(*tasks.values(), optimize_graph=False, **how)
+    finally:
+        if torch is not None:
+            torch.set_num_threads(threads)
+    return dict(zip(tasks, results, strict=True))
+
+
+def _on_cluster(tasks: dict[str, Delayed], label: str, address: str, _: int) -> dict[str, Any]:
+    # Late: the cluster's library takes a second to load, and few runs use it.
+    from distributed import Client, KilledWorker, as_completed
+
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"--scheduler {address}: no Dask scheduler answers there ({error}).",
+            "Start one with `dask scheduler`, or leave the flag away.",
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=30)
+        except TimeoutError:
+            raise UserError(
+                f"--scheduler {address}: the cluster has no workers.",
+                "Start `dask worker` with its address.",
+            ) from None
+        futures = dict(zip(client.compute(list(tasks.values()), retries=2), tasks, strict=True))
+        results = {}
+        with tqdm(total=len(tasks), desc=label, unit="image", leave=False) as bar:
+            for future in as_completed(futures):
+                try:
+                    results[futures[future]] = future.result()
+                except KilledWorker as error:
+                    raise UserError(
+                        f"{label}: the workers died on {futures[future]} ({error}).",
+                        "Most often they ran out of memory: give them more, or fewer threads each.",
+                    ) from None
+                bar.update()
+    return {name: results[name] for name in tasks}

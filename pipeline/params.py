@@ -1,0 +1,116 @@
+"""One stage's parameters out of params.yaml, checked, with every problem told at once."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+from ruamel.yaml import YAML, YAMLError
+
+from pipeline.errors import UserError
+
+STAGES = Path(__file__).resolve().parents[1] / "stages"
+OTHER_SECTIONS = ("scenes", "variants", "comparisons")
+
+
+class Section(pydantic.BaseModel):
+    """The parameters of one stage. Fields carry their ranges and no defaults: params.yaml holds all."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+S = TypeVar("S", bound=Section)
+
+
+def read_section(
+    file: Path, name: str, section_type: type[S], scene: str, variant: str | None = None
+) -> S:
+    """The validated section `name` of params.yaml for `scene` (and `variant`).
+
+    The scene's own values under `scenes.<scene>.<name>` replace the section's, and the variant's under
+    `variants.<variant>.<name>` replace both. UserError lists every unknown, missing or out-of-range key.
+    """
+    content = read_params(file)
+    merged: dict[str, Any] = {}
+    for where, values in _layers(file, content, name, scene, variant):
+        if not isinstance(values, Mapping):
+            raise UserError(f"{file.name}: {where} should hold key: value pairs.")
+        merged |= values
+    try:
+        return section_type.model_validate(merged)
+    except pydantic.ValidationError as error:
+        problems = [_sentence(name, problem, section_type) for problem in error.errors()]
+        raise UserError(
+            f"{file.name}: " + "; ".join(problems) + ".", f"Correct {file} and run again."
+        ) from None
+
+
+def read_params(file: Path) -> dict[str, Any]:
+    """params.yaml as DVC reads it (YAML 1.2); UserError when missing, malformed or with unknown sections."""
+    try:
+        content = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{file} is not valid YAML: {' '.join(str(error).split())}.") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{file} should hold sections of key: value pairs.")
+    known = (*stage_names(), *OTHER_SECTIONS)
+    _refuse_unknown(file, "section", content, known)
+    for kind in ("scenes", "variants"):
+        for name, overrides in (content.get(kind) or {}).items():
+            _refuse_unknown(file, f"section in {kind}.{name}", overrides or {}, stage_names())
+    return content
+
+
+def stage_names() -> list[str]:
+    """The names of all stages, which are the names of their sections."""
+    return sorted(path.stem for path in STAGES.glob("*.py") if path.stem != "__init__")
+
+
+def _layers(
+    file: Path, content: Mapping[str, Any], name: str, scene: str, variant: str | None
+) -> Iterable[tuple[str, Any]]:
+    if name not in content:
+        raise UserError(f"{file.name}: the section {name} is missing.")
+    yield name, content[name] or {}
+    yield f"scenes.{scene}.{name}", _chosen(file, content, "scenes", scene).get(name) or {}
+    if variant is not None:
+        yield (
+            f"variants.{variant}.{name}",
+            _chosen(file, content, "variants", variant).get(name) or {},
+        )
+
+
+def _chosen(file: Path, content: Mapping[str, Any], kind: str, name: str) -> Mapping[str, Any]:
+    choices = content.get(kind) or {}
+    if name not in choices:
+        raise UserError(
+            f"{file.name}: {kind}.{name} does not exist.{_nearest(name, choices)}",
+            f"Add it under {kind}: in {file}.",
+        )
+    return choices[name] or {}
+
+
+def _refuse_unknown(file: Path, what: str, given: Mapping[str, Any], known: Iterable[str]) -> None:
+    known = list(known)
+    for name in given:
+        if name not in known:
+            raise UserError(f"{file.name}: unknown {what}: {name}.{_nearest(str(name), known)}")
+
+
+def _nearest(name: str, choices: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, [str(choice) for choice in choices], n=1, cutoff=0.5)
+    return f" Did you mean {close[0]}?" if close else ""
+
+
+def _sentence(section: str, problem: Any, section_type: type[Section]) -> str:
+    keys = ".".join(str(part) for part in problem["loc"])
+    where = f"{section}.{keys}" if keys else section
+    if problem["type"] == "extra_forbidden":
+        return f"{where} is unknown.{_nearest(keys, section_type.model_fields)}".rstrip(".")
+    if problem["type"] == "missing":
+        return f"{where} is missing"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{where}: {message[0].lower()}{message[1:]} (got {problem['input']!r})"

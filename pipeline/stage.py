@@ -1,0 +1,183 @@
+"""The runner that every stage shares: flags, parameters, logs, locks and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, TypeVar
+
+import filelock
+from tqdm import tqdm
+
+from pipeline.errors import UserError
+from pipeline.io.paths import ScenePaths
+from pipeline.params import Section, read_section
+
+__all__ = ["Job", "Section", "run"]
+
+USER_FAULT = 2
+INTERRUPTED = 130
+TERMINATED = 143
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+P = TypeVar("P", bound=Section)
+log = logging.getLogger("derainnerf")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one stage: where it works and on what it computes.
+
+    Nothing in here may change a result; what does lies in the stage's parameters.
+    """
+
+    root: Path
+    scene: str
+    variant: str | None
+    device_wish: str
+    scheduler: str | None
+    verbose: bool
+
+    @property
+    def paths(self) -> ScenePaths:
+        return ScenePaths(self.root, self.scene, self.variant)
+
+    @cached_property
+    def device(self) -> str:
+        """ "cuda" or "cpu"; UserError when CUDA was asked for and there is none."""
+        import torch  # late: half of the stages need no torch, and it takes seconds to load
+
+        available = torch.cuda.is_available()
+        if self.device_wish == "cuda" and not available:
+            raise UserError("--device cuda: no usable CUDA device was found.", "Use --device auto.")
+        device = "cuda" if available and self.device_wish != "cpu" else "cpu"
+        log.info("computing on %s", device)
+        return device
+
+    def resolve(self, path: str) -> Path:
+        """`path` from params.yaml: absolute, or relative to the folder of params.yaml."""
+        return self.root / Path(path).expanduser()
+
+
+class _AboveProgressBars(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        tqdm.write(self.format(record), file=sys.stderr)
+
+
+def run(name: str, params_type: type[P], main: Callable[[Job, P], str | None]) -> NoReturn:
+    """Runs stage `name` and leaves the process.
+
+    Exit codes: 0 done; 2 a fault the user can mend, told in one sentence; 1 a bug, with its traceback;
+    130 interrupted; 143 terminated. `main` returns the closing sentence, or None.
+    """
+    signal.signal(signal.SIGTERM, _terminate)
+    _die_with_dvc()
+    try:
+        sys.exit(_run(name, params_type, main, sys.argv[1:]))
+    except UserError as error:
+        print(f"{name}: {error.what}", file=sys.stderr)
+        if error.hint:
+            print(f"  {error.hint}", file=sys.stderr)
+        sys.exit(USER_FAULT)
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted; nothing half-written is left.", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+def _run(
+    name: str, params_type: type[P], main: Callable[[Job, P], str | None], argv: Sequence[str]
+) -> int:
+    flags = _parser(name).parse_args(argv)
+    params_file = _params_file(flags.params)
+    job = Job(
+        params_file.parent, flags.scene, flags.variant, flags.device, flags.scheduler, flags.verbose
+    )
+    params = read_section(params_file, name, params_type, job.scene, job.variant)
+    work = job.paths.work(name)
+    work.mkdir(parents=True, exist_ok=True)
+    _log_to(work / "log.txt", job.verbose)
+    try:
+        with filelock.FileLock(work / "lock", timeout=0):
+            closing = main(job, params)
+    except filelock.Timeout:
+        raise UserError(
+            f"stage {name} of scene {job.scene} is already running.",
+            "Wait for it, or end it first.",
+        ) from None
+    except Exception:
+        # The traceback belongs into the log as well: the terminal may be gone when someone asks.
+        log.debug("stage %s failed", name, exc_info=True)
+        raise
+    if closing:
+        log.info("%s: %s", name, closing)
+    return 0
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"python -m stages.{name}",
+        description=f"Runs the stage `{name}` of one scene. Its parameters are the section `{name}` of "
+        "params.yaml, with the scene's own values under scenes.<scene>.",
+    )
+    parser.add_argument("--scene", required=True, help="a scene named in params.yaml")
+    parser.add_argument("--variant", help="a variant named in params.yaml, e.g. unmasked")
+    parser.add_argument(
+        "--params", type=Path, help="params.yaml (default: the one here, else the checkout's)"
+    )
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument(
+        "--scheduler",
+        default=os.environ.get("DERAINNERF_SCHEDULER") or None,
+        help="address of a running Dask cluster, tcp://host:port (default: threads on this machine)",
+    )
+    parser.add_argument("--verbose", action="store_true", help="log details to the terminal too")
+    return parser
+
+
+def _params_file(wish: Path | None) -> Path:
+    if wish is None:
+        here = Path.cwd() / "params.yaml"
+        wish = here if here.is_file() else CHECKOUT / "params.yaml"
+    if not wish.is_file():
+        raise UserError(f"{wish} does not exist.", "Name the file with --params.")
+    return wish.resolve()
+
+
+def _log_to(path: Path, verbose: bool) -> None:
+    root = logging.getLogger()
+    root.setLevel(logging.DEBUG if verbose else logging.INFO)
+    for noisy in ("PIL", "distributed", "asyncio", "filelock", "matplotlib", "torch"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    file = logging.FileHandler(path, mode="w", encoding="utf-8")
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    terminal = _AboveProgressBars(logging.DEBUG if verbose else logging.INFO)
+    terminal.setFormatter(logging.Formatter("%(message)s"))
+    root.handlers = [file, terminal]
+
+
+def _terminate(signum: int, frame: FrameType | None) -> NoReturn:
+    """Leaves through `finally`, so that temporary folders are removed."""
+    sys.exit(TERMINATED)
+
+
+def _die_with_dvc() -> None:
+    """Under DVC, asks the kernel to end this process with its parent.
+
+    A killed `dvc repro` would otherwise leave the stage running, writing into the next run's outputs.
+    """
+    if not sys.platform.startswith("linux") or "DVC_STAGE" not in os.environ:
+        return
+    parent = os.getppid()
+    pr_set_pdeathsig: Any = 1
+    ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)
+    if os.getppid() != parent:
+        sys.exit(TERMINATED)
