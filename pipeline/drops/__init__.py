@@ -1,0 +1,1 @@
+"""Physics of water drops on glass: shape, refraction, image-space painter, ray-traced scenes."""
