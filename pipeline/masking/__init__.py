@@ -1,0 +1,1 @@
+"""From attention maps to drop masks: threshold, dilation and the temporal mean."""

@@ -1,0 +1,71 @@
+"""Drop masks from attention maps (paper, equations 3 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+
+
+def threshold(attention: np.ndarray, t: float) -> np.ndarray:
+    """The (H, W) drop mask M(u, v) = f(A(u, v), t) of equation 3: True where the attention exceeds t."""
+    return attention > t
+
+
+def temporal_mean(attentions: Iterable[np.ndarray]) -> np.ndarray:
+    """The (H, W) float32 mean of n attention maps of one size, the sum over A_i / n in equation 5."""
+    total: np.ndarray | None = None
+    count = 0
+    for attention in attentions:
+        total = attention.astype(np.float64) if total is None else total + attention
+        count += 1
+    if total is None:
+        raise ValueError("the mean of no attention maps does not exist")
+    return (total / count).astype(np.float32)
+
+
+def enhanced(attention: np.ndarray, mean_attention: np.ndarray, t: float) -> np.ndarray:
+    """The (H, W) drop mask of equation 5: f(A, t) or f(mean A, t)."""
+    return threshold(attention, t) | threshold(mean_attention, t)
+
+
+def dilate(drop_mask: np.ndarray, pixels: int) -> np.ndarray:
+    """`drop_mask` grown by `pixels` in every direction (a disc); 0 leaves it as it is."""
+    if pixels == 0:
+        return drop_mask
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return cv2.dilate(drop_mask.astype(np.uint8), disc).astype(bool)
+
+
+def without_specks(drop_mask: np.ndarray, min_area: int) -> np.ndarray:
+    """`drop_mask` without connected regions of fewer than `min_area` pixels (8-neighbourhood)."""
+    if min_area <= 1:
+        return drop_mask
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        drop_mask.astype(np.uint8), connectivity=8
+    )
+    large = stats[:, cv2.CC_STAT_AREA] >= min_area
+    large[0] = False
+    return large[labels]
+
+
+def lens_fixedness(attentions: Sequence[np.ndarray], t: float) -> float:
+    """How much better the maps agree per pixel than chance would have it, at most 1.
+
+    Each map is thresholded at t. For masks that never move, the chance that a pixel marked in one view is
+    marked in another is 1; for masks unrelated between views it is their density p. Returned is
+    (agreement - p) / (1 - p), from all pairs of views at once; 0 when nothing, or everything, is marked.
+    """
+    count = len(attentions)
+    if count < 2:
+        return 0.0
+    votes = np.zeros(attentions[0].shape, np.float64)
+    for attention in attentions:
+        votes += threshold(attention, t)
+    density = votes.mean() / count
+    if density in (0.0, 1.0):
+        return 0.0
+    # sum over pixels of ordered pairs of views in which both mark it / ordered pairs in which the first does
+    agreement = float((votes * (votes - 1)).sum() / (votes.sum() * (count - 1)))
+    return (agreement - density) / (1.0 - density)

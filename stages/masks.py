@@ -1,0 +1,114 @@
+"""Attention maps in, keep masks out: threshold, temporal mean for drops on the lens, dilation."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import publish_dir, write_json
+from pipeline.io.maps import read_map
+from pipeline.io.masks import write_keep_mask
+from pipeline.io.scene import ImageRecord, read_images_json
+from pipeline.masking.masks import (
+    dilate, enhanced, lens_fixedness, temporal_mean, threshold, without_specks,
+)  # fmt: skip
+from pipeline.parallel import map_named
+from pipeline.stage import Job, Section, run
+
+log = logging.getLogger(__name__)
+
+
+class Params(Section):
+    """Section `masks`."""
+
+    threshold: Annotated[float, Field(ge=0, le=1)]
+    temporal_mean: Literal["auto", "on", "off"]
+    lens_fixed_from: Annotated[float, Field(ge=0, le=1)]
+    dilation: Annotated[int, Field(ge=0, le=100)]
+    min_area: Annotated[int, Field(ge=0)]
+
+
+def main(job: Job, params: Params) -> str:
+    """Makes `artifacts/<scene>/masks/` from the attention maps."""
+    records = read_images_json(job.paths.images)
+    maps = {record.name: _read_attention(job, record) for record in records}
+    mean = temporal_mean(maps.values())
+    fixed, why = _lens_fixed(list(maps.values()), params)
+    with publish_dir(job.paths.masks) as fresh:
+        coverage = map_named(
+            write_mask,
+            {
+                name: (attention, mean if fixed else None, fresh / name, params)
+                for name, attention in maps.items()
+            },
+            job_label="masks",
+        )
+        everything = [name for name, share in coverage.items() if share == 1.0]
+        if len(everything) == len(coverage):
+            raise UserError(
+                "every pixel of every image would be masked: nothing would be left to learn from.",
+                "Raise masks.threshold or lower masks.dilation.",
+            )
+        share = float(np.mean(list(coverage.values())))
+        write_json(
+            fresh / "masks.json",
+            {
+                "threshold": params.threshold,
+                "dilation": params.dilation,
+                "mode": "lens-fixed" if fixed else "per-image",
+                "why": why,
+                "coverage": {name: round(value, 6) for name, value in coverage.items()},
+                "mean_coverage": round(share, 6),
+                "fully_masked": everything,
+            },
+        )
+    for name in everything:
+        log.warning("%s is masked entirely and will teach the scene nothing", name)
+    if share == 0:
+        log.warning("no drops were found in any image; lower masks.threshold if there are some")
+    elif share > 0.6:
+        log.warning(
+            "%.0f %% of the pixels are masked; raise masks.threshold if that is too much",
+            100 * share,
+        )
+    return f"{100 * share:.1f} % of the pixels masked, {'lens-fixed' if fixed else 'image by image'} ({why})"
+
+
+def write_mask(attention: np.ndarray, mean: np.ndarray | None, path: Path, params: Params) -> float:
+    """Writes one keep mask and returns the share of pixels it drops."""
+    t = params.threshold
+    drop_mask = threshold(attention, t) if mean is None else enhanced(attention, mean, t)
+    drop_mask = dilate(without_specks(drop_mask, params.min_area), params.dilation)
+    write_keep_mask(path, ~drop_mask)
+    return float(drop_mask.mean())
+
+
+def _read_attention(job: Job, record: ImageRecord) -> np.ndarray:
+    path = job.paths.attention / f"{record.stem}.exr"
+    attention = read_map(path)
+    if attention.shape != (record.height, record.width):
+        raise UserError(
+            f"{path} is {attention.shape[1]}x{attention.shape[0]}, its image {record.width}x{record.height}.",
+            "Run `python -m stages.attention` again.",
+        )
+    return attention
+
+
+def _lens_fixed(attentions: list[np.ndarray], params: Params) -> tuple[bool, str]:
+    if params.temporal_mean != "auto":
+        return params.temporal_mean == "on", f"masks.temporal_mean is {params.temporal_mean}"
+    agreement = lens_fixedness(attentions, params.threshold)
+    sign = ">=" if agreement >= params.lens_fixed_from else "<"
+    return (
+        agreement >= params.lens_fixed_from,
+        f"the maps agree to {agreement:.2f} {sign} {params.lens_fixed_from:g} per pixel",
+    )
+
+
+if __name__ == "__main__":
+    run("masks", Params, main)
