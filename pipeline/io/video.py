@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
-import io
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 import av
 import numpy as np
 
-from pipeline.io.atomic import write_bytes
+from pipeline.io.atomic import disk_faults
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
     """Writes (H, W, 3) float RGB frames in [0, 1] as mp4; odd sides lose their last row or column."""
-    buffer = io.BytesIO()
-    with av.open(buffer, "w", format="mp4", options={"movflags": "faststart"}) as container:
+    with disk_faults(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = path.parent / f".{path.stem}.tmp-{os.getpid()}.mp4"
+        try:
+            _encode(fresh, frames, fps)
+            fresh.replace(path)
+        finally:
+            fresh.unlink(missing_ok=True)
+
+
+def _encode(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
+    # The index first (faststart), so that a browser plays before it has everything.
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "20", "threads": "1"})
         stream.pix_fmt = "yuv420p"
         for number, frame in enumerate(frames):
             pixels = np.rint(np.clip(frame, 0.0, 1.0) * 255).astype(np.uint8)
-            pixels = np.ascontiguousarray(
-                pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
-            )
+            height, width = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
             if number == 0:
-                stream.height, stream.width = pixels.shape[:2]
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
+                stream.height, stream.width = height, width
+            even = np.ascontiguousarray(pixels[:height, :width])
+            for packet in stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")):
                 container.mux(packet)
         for packet in stream.encode(None):
             container.mux(packet)
-    write_bytes(path, buffer.getvalue())

@@ -34,7 +34,8 @@ def dilate(drop_mask: np.ndarray, pixels: int) -> np.ndarray:
     """`drop_mask` grown by `pixels` in every direction (a disc); 0 leaves it as it is."""
     if pixels == 0:
         return drop_mask
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    rows, columns = np.ogrid[-pixels : pixels + 1, -pixels : pixels + 1]
+    disc = (rows**2 + columns**2 <= pixels**2).astype(np.uint8)
     return cv2.dilate(drop_mask.astype(np.uint8), disc).astype(bool)
 
 

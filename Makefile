@@ -1,0 +1,43 @@
+# Two commands: `make demo` and `make test`. The rest is for those who work on the project.
+VENV ?= .venv
+SCENE ?= demo
+BIN := $(VENV)/bin
+export PATH := $(abspath $(BIN)):$(PATH)
+
+.PHONY: demo test check format setup scene report synth clean
+
+demo: setup
+	dvc repro --glob '*@demo*'
+	@python -m pipeline.evaluation.table artifacts/demo/metrics.json artifacts/demo/unmasked/metrics.json
+	@echo "Open $(abspath artifacts/demo/report/index.html)"
+
+test: setup
+	python -m pytest
+
+check: setup
+	ruff check .
+	ruff format --check .
+	mypy
+	lint-imports
+
+format: setup
+	ruff check --fix .
+	ruff format .
+
+# make scene SCENE=garden: everything for one scene of params.yaml
+scene: setup
+	dvc repro --glob '*@$(SCENE)'
+	@python -m pipeline.evaluation.table artifacts/$(SCENE)/metrics.json
+	@echo "Open $(abspath artifacts/$(SCENE)/report/index.html)"
+
+setup: $(VENV)/.ready
+	@if [ ! -e .git ]; then dvc config --local core.no_scm true; fi
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	python3 -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed")'
+	python3 -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' -c constraints.txt
+	@touch $@
+
+clean:
+	rm -rf artifacts .dvc/tmp

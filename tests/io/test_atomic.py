@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import disk_faults, publish_dir, read_json, write_bytes, write_json
+
+
+def test_a_published_folder_replaces_the_old_one_whole(tmp_path: Path) -> None:
+    final = tmp_path / "masks"
+    final.mkdir()
+    (final / "stale.png").write_bytes(b"old")
+    with publish_dir(final) as fresh:
+        (fresh / "new.png").write_bytes(b"new")
+        assert (final / "stale.png").exists(), "the old result stands until the new one is complete"
+    assert [path.name for path in final.iterdir()] == ["new.png"]
+    assert [path.name for path in tmp_path.iterdir()] == ["masks"], "no temporary folder is left"
+
+
+def test_a_failure_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:
+    final = tmp_path / "masks"
+    final.mkdir()
+    (final / "old.png").write_bytes(b"old")
+    with pytest.raises(RuntimeError), publish_dir(final) as fresh:
+        (fresh / "half.png").write_bytes(b"half")
+        raise RuntimeError("killed")
+    assert [path.name for path in final.iterdir()] == ["old.png"]
+    assert [path.name for path in tmp_path.iterdir()] == ["masks"]
+
+
+def test_leftovers_of_a_killed_run_are_cleared(tmp_path: Path) -> None:
+    (tmp_path / ".masks.tmp-12345").mkdir()
+    with publish_dir(tmp_path / "masks"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["masks"]
+
+
+def test_a_file_appears_whole(tmp_path: Path) -> None:
+    write_bytes(tmp_path / "deep" / "a.bin", b"abc")
+    assert (tmp_path / "deep" / "a.bin").read_bytes() == b"abc"
+    assert len(list((tmp_path / "deep").iterdir())) == 1
+
+
+def test_a_full_disk_is_a_sentence() -> None:
+    with pytest.raises(UserError, match="the disk is full"), disk_faults(Path("x")):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_json_keeps_no_nan_and_names_the_stage_to_run(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "a.json", {"psnr": float("nan")})
+    assert not (tmp_path / "a.json").exists()
+    with pytest.raises(UserError, match=r"stages\.poses"):
+        read_json(tmp_path / "a.json", made_by="poses")
+    (tmp_path / "a.json").write_text('{"cut": ')
+    with pytest.raises(UserError, match="damaged"):
+        read_json(tmp_path / "a.json", made_by="poses")

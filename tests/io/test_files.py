@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.io.images import read_image, write_image
+from pipeline.io.maps import read_depth, read_map, write_depth, write_map
+from pipeline.io.masks import read_keep_mask, write_keep_mask
+from pipeline.io.tensors import load_tensors, save_tensors
+from pipeline.io.transforms import View, read_transforms, write_transforms
+from pipeline.io.video import write_video
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_an_image_comes_back_to_the_last_bit(tmp_path: Path, rng: np.random.Generator) -> None:
+    pixels = rng.integers(0, 256, (13, 17, 3), dtype=np.uint8)
+    write_image(tmp_path / "a.png", pixels)
+    back = read_image(tmp_path / "a.png")
+    assert back.dtype == np.float32
+    assert np.array_equal(np.rint(back * 255).astype(np.uint8), pixels)
+    write_image(tmp_path / "b.png", back)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_red_is_the_first_channel(tmp_path: Path) -> None:
+    red = np.zeros((4, 4, 3), np.float32)
+    red[..., 0] = 1
+    write_image(tmp_path / "red.png", red)
+    assert np.array_equal(read_image(tmp_path / "red.png"), red)
+
+
+def test_a_map_comes_back_within_half_precision(tmp_path: Path, rng: np.random.Generator) -> None:
+    values = rng.random((11, 7), np.float32)
+    write_map(tmp_path / "a.exr", values, {"attention:model": "test"})
+    assert np.abs(read_map(tmp_path / "a.exr") - values).max() < 5e-4
+
+
+def test_maps_written_at_different_times_have_the_same_bytes(tmp_path: Path) -> None:
+    values = np.linspace(0, 1, 64, dtype=np.float32).reshape(8, 8)
+    write_map(tmp_path / "a.exr", values)
+    time.sleep(1.1)
+    write_map(tmp_path / "b.exr", values)
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_a_damaged_map_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    write_map(tmp_path / "a.exr", rng.random((64, 64), np.float32))
+    data = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(data[: len(data) // 2])
+    with pytest.raises(UserError, match="cannot be read"):
+        read_map(tmp_path / "cut.exr")
+    with pytest.raises(UserError, match=r"stages\.attention"):
+        read_map(tmp_path / "missing.exr")
+    with pytest.raises(ValueError, match="NaN"):
+        write_map(tmp_path / "nan.exr", np.full((2, 2), np.nan, np.float32))
+
+
+def test_depth_keeps_single_precision(tmp_path: Path, rng: np.random.Generator) -> None:
+    depth = rng.random((5, 6), np.float32) * 1000
+    write_depth(tmp_path / "d.exr", depth)
+    assert np.array_equal(read_depth(tmp_path / "d.exr"), depth)
+
+
+def test_masks_are_255_for_keep(tmp_path: Path, rng: np.random.Generator) -> None:
+    keep_mask = rng.random((9, 12)) > 0.5
+    write_keep_mask(tmp_path / "m.png", keep_mask)
+    stored = cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(stored, np.where(keep_mask, 255, 0))
+    assert np.array_equal(read_keep_mask(tmp_path / "m.png", (12, 9)), keep_mask)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        (np.ones((4, 5), np.uint8), "other than 0"),
+        (np.zeros((4, 5, 3), np.uint8), "3 channels"),
+        (np.zeros((5, 5), np.uint8), "its image is 5x4"),
+    ],
+)
+def test_a_mask_that_means_something_else_is_refused(
+    tmp_path: Path, values: np.ndarray, sentence: str
+) -> None:
+    cv2.imwrite(str(tmp_path / "m.png"), values)
+    with pytest.raises(UserError, match=sentence):
+        read_keep_mask(tmp_path / "m.png", (5, 4))
+
+
+def test_only_booleans_are_masks(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="bool"):
+        write_keep_mask(tmp_path / "m.png", np.ones((2, 2), np.uint8))
+
+
+def test_tensors_and_their_metadata_come_back_with_the_same_bytes(tmp_path: Path) -> None:
+    tensors = {"b": np.arange(6.0).reshape(2, 3), "a": np.ones(3, np.float16)}
+    metadata = {str(number): "x" * number for number in range(20)}
+    save_tensors(tmp_path / "one.safetensors", tensors, metadata)
+    save_tensors(tmp_path / "two.safetensors", dict(reversed(tensors.items())), metadata)
+    assert (tmp_path / "one.safetensors").read_bytes() == (tmp_path / "two.safetensors").read_bytes()
+    back, header = load_tensors(tmp_path / "one.safetensors")
+    assert header == metadata
+    assert all(np.array_equal(back[name], tensors[name]) for name in tensors)
+    (tmp_path / "bad.safetensors").write_bytes(b"not tensors")
+    with pytest.raises(UserError, match="safetensors"):
+        load_tensors(tmp_path / "bad.safetensors")
+
+
+def _view(name: str) -> View:
+    angle = 0.3
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[:3, 3] = [1, 2, 3]
+    return View(name, pose, 100.0, 101.0, 32.0, 24.0, -0.05, 64, 48, 0.5, 9.0)
+
+
+def test_posed_views_come_back(tmp_path: Path) -> None:
+    views = {name: _view(name) for name in ("b.png", "a.png")}
+    write_transforms(tmp_path / "transforms.json", views.values())
+    back = read_transforms(tmp_path / "transforms.json")
+    assert list(back) == ["a.png", "b.png"]
+    assert np.allclose(back["a.png"].cam_from_world, views["a.png"].cam_from_world, atol=1e-10)
+    assert (back["b.png"].fx, back["b.png"].k1, back["b.png"].far) == (100.0, -0.05, 9.0)
+
+
+def test_the_file_holds_opengl_axes(tmp_path: Path) -> None:
+    """A camera at the origin looking along +z (OpenCV) looks along -z of its own OpenGL frame."""
+    view = View("a.png", np.eye(4), 1, 1, 0, 0, 0, 2, 2, 1, 2)
+    write_transforms(tmp_path / "t.json", [view])
+    import json
+
+    matrix = json.loads((tmp_path / "t.json").read_text())["frames"][0]["transform_matrix"]
+    assert np.array_equal(np.array(matrix), np.diag([1, -1, -1, 1]))
+
+
+def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[0, 0] = 2
+    write_transforms(tmp_path / "t.json", [View("a.png", pose, 1, 1, 0, 0, 0, 2, 2, 1, 2)])
+    with pytest.raises(UserError, match=r"a\.png"):
+        read_transforms(tmp_path / "t.json")
+
+
+def test_a_video_has_every_frame_even_sides_and_the_same_bytes(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    frames = [rng.random((33, 47, 3)) for _ in range(7)]
+    write_video(tmp_path / "a.mp4", frames, fps=10)
+    write_video(tmp_path / "b.mp4", frames, fps=10)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    with av.open(str(tmp_path / "a.mp4")) as video:
+        decoded = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(decoded) == 7
+    assert decoded[0].shape == (32, 46, 3)

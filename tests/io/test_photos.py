@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import UserError
+from pipeline.io.images import read_photo, turn
+from pipeline.io.photos import common_turns, convert, examine, image_name, list_photos
+
+ORIENTATION = 0x0112
+FOCAL_35MM = 0xA405
+EXIF_IFD = 0x8769
+
+
+def _photo(path: Path, size: tuple[int, int] = (40, 30), orientation: int = 1, focal: int = 0) -> Path:
+    """A photo whose stored top left corner is red and top right corner is green."""
+    pixels = np.full((size[1], size[0], 3), 90, np.uint8)
+    pixels[:8, :8] = (250, 0, 0)
+    pixels[:8, -8:] = (0, 250, 0)
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    if focal:
+        exif.get_ifd(EXIF_IFD)[FOCAL_35MM] = focal
+    Image.fromarray(pixels).save(path, quality=95, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_become_upright_as_the_metadata_says(tmp_path: Path, orientation: int) -> None:
+    from PIL import ImageOps
+
+    path = _photo(tmp_path / "a.jpg", orientation=orientation)
+    pixels, info = read_photo(path)
+    with Image.open(path) as photo:
+        expected = np.asarray(ImageOps.exif_transpose(photo).convert("RGB"))
+    assert np.array_equal(turn(pixels, info.upright_turn), expected)
+
+
+def test_focal_length_in_pixels_from_the_35mm_equivalent(tmp_path: Path) -> None:
+    # 43.27 mm is the diagonal of 35 mm film; the photo's is 50 px: f = 28 / 43.27 * 50 = 32.36 px
+    photo = examine(_photo(tmp_path / "a.jpg", focal=28))
+    assert photo.focal_px == pytest.approx(32.36, abs=0.01)
+    assert examine(_photo(tmp_path / "b.jpg")).focal_px is None
+
+
+def test_portrait_and_landscape_of_one_camera_get_one_size(tmp_path: Path) -> None:
+    photos = {
+        name: examine(_photo(tmp_path / name, orientation=orientation))
+        for name, orientation in (("a.jpg", 1), ("b.jpg", 1), ("c.jpg", 6))
+    }
+    turns = common_turns(photos)
+    assert turns == {"a.jpg": 0, "b.jpg": 0, "c.jpg": 0}, "all in the frame of the sensor"
+    portraits = {name: examine(_photo(tmp_path / name, orientation=6)) for name in ("d.jpg", "e.jpg")}
+    assert set(common_turns(portraits).values()) == {270}, "all portrait: upright"
+
+
+def test_mixed_sizes_are_refused_with_the_sizes(tmp_path: Path) -> None:
+    photos = {
+        "a.png": examine(_photo(tmp_path / "a.jpg", (40, 30))),
+        "b.png": examine(_photo(tmp_path / "b.jpg", (44, 30))),
+    }
+    with pytest.raises(UserError, match=r"1 of 40x30, 1 of 44x30"):
+        common_turns(photos)
+
+
+def test_images_are_only_ever_scaled_down(tmp_path: Path) -> None:
+    path = _photo(tmp_path / "a.jpg", (400, 300))
+    assert convert(path, tmp_path / "a.png", 0, 200) == (200, 150)
+    assert convert(path, tmp_path / "b.png", 90, 0) == (300, 400)
+    assert convert(path, tmp_path / "c.png", 0, 4000) == (400, 300)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "CMYK", "I;16", "LA"])
+def test_every_kind_of_pixel_becomes_rgb(tmp_path: Path, mode: str) -> None:
+    if mode == "I;16":
+        photo = Image.fromarray(np.full((6, 8), 65535, np.uint16))
+    else:
+        photo = Image.new("RGB", (8, 6), "white").convert(mode)
+    path = tmp_path / ("a.tif" if mode in ("CMYK", "I;16") else "a.png")
+    photo.save(path)
+    pixels, _ = read_photo(path)
+    assert pixels.shape == (6, 8, 3)
+    assert pixels.dtype == np.uint8
+    assert pixels.min() >= 250
+
+
+def test_what_is_no_photo_is_named(tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("not a photo")
+    with pytest.raises(UserError, match=r"text\.jpg is not an image"):
+        read_photo(tmp_path / "text.jpg")
+    (tmp_path / "empty.jpg").touch()
+    with pytest.raises(UserError, match=r"empty\.jpg"):
+        read_photo(tmp_path / "empty.jpg")
+    whole = _photo(tmp_path / "whole.jpg", (400, 300)).read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    with pytest.raises(UserError, match=r"cut\.jpg is damaged or cut short"):
+        read_photo(tmp_path / "cut.jpg")
+
+
+def test_the_folder_is_listed_by_the_names_images_will_have(tmp_path: Path) -> None:
+    for name in ("b two.JPG", "a.jpg", "mean.png"):
+        _photo(tmp_path / Path(name).with_suffix(".jpg")).rename(tmp_path / name)
+    (tmp_path / ".DS_Store").touch()
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "truth").mkdir()
+    assert list(list_photos(tmp_path, 1)) == ["a.png", "b_two.png", "mean_.png"]
+    assert image_name(Path("-x.jpg")) == "_x.png"
+    with pytest.raises(UserError, match="3 photos only"):
+        list_photos(tmp_path, 4)
+    _photo(tmp_path / "a.png")
+    with pytest.raises(UserError, match=r"both become a\.png"):
+        list_photos(tmp_path, 1)
+
+
+def test_kinds_that_cannot_be_read_name_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "a.heic").touch()
+    with pytest.raises(UserError, match="Convert them to JPEG"):
+        list_photos(tmp_path, 1)

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.masking.masks import (
+    dilate,
+    enhanced,
+    lens_fixedness,
+    temporal_mean,
+    threshold,
+    without_specks,
+)
+
+
+def test_equation_3_by_hand() -> None:
+    attention = np.array([[0.1, 0.3, 0.31], [0.9, 0.0, 0.29]], np.float32)
+    assert np.array_equal(threshold(attention, 0.3), attention > 0.3)
+    assert threshold(attention, 0.305).tolist() == [[False, False, True], [True, False, False]]
+
+
+def test_equation_5_by_hand() -> None:
+    # The drop at the left is seen in the first two of three maps: its mean is 0.6 > 0.5, so the third
+    # view's mask has it too. The false alarm in the middle stays in its own view (mean 0.3).
+    maps = [
+        np.array([[0.9, 0.0, 0.1]], np.float32),
+        np.array([[0.9, 0.9, 0.1]], np.float32),
+        np.array([[0.0, 0.0, 0.1]], np.float32),
+    ]
+    mean = temporal_mean(maps)
+    assert np.allclose(mean, [[0.6, 0.3, 0.1]])
+    assert enhanced(maps[0], mean, 0.5).tolist() == [[True, False, False]]
+    assert enhanced(maps[1], mean, 0.5).tolist() == [[True, True, False]]
+    assert enhanced(maps[2], mean, 0.5).tolist() == [[True, False, False]]
+
+
+def test_a_mean_needs_a_map() -> None:
+    with pytest.raises(ValueError, match="no attention maps"):
+        temporal_mean([])
+
+
+def test_dilation_grows_a_point_to_a_disc() -> None:
+    drop_mask = np.zeros((11, 11), bool)
+    drop_mask[5, 5] = True
+    grown = dilate(drop_mask, 2)
+    rows, columns = np.nonzero(grown)
+    assert np.hypot(rows - 5, columns - 5).max() == 2
+    assert grown[5, 3:8].all()
+    assert grown[3:8, 5].all()
+    assert np.array_equal(dilate(drop_mask, 0), drop_mask)
+    assert np.array_equal(dilate(drop_mask, 1) & drop_mask, drop_mask)
+
+
+def test_specks_go_and_drops_stay() -> None:
+    drop_mask = np.zeros((8, 8), bool)
+    drop_mask[0, 0] = True
+    drop_mask[4:7, 4:7] = True
+    cleaned = without_specks(drop_mask, 4)
+    assert not cleaned[0, 0]
+    assert cleaned.sum() == 9
+    assert np.array_equal(without_specks(drop_mask, 0), drop_mask)
+
+
+def test_drops_that_never_move_agree_and_independent_ones_do_not() -> None:
+    rng = np.random.default_rng(0)
+    still = (rng.random((60, 80)) > 0.8).astype(np.float32)
+    assert lens_fixedness([still] * 5, 0.5) == pytest.approx(1.0)
+    moving = [(rng.random((60, 80)) > 0.8).astype(np.float32) for _ in range(5)]
+    assert abs(lens_fixedness(moving, 0.5)) < 0.02
+
+
+def test_nothing_marked_is_not_lens_fixed() -> None:
+    assert lens_fixedness([np.zeros((4, 4), np.float32)] * 3, 0.5) == 0.0
+    assert lens_fixedness([np.ones((4, 4), np.float32)] * 3, 0.5) == 0.0
