@@ -23,8 +23,9 @@ Array = NDArray[np.float64]
 
 TABLE = 1024  # directions at which a drop's outline is tabulated
 WOBBLE_ORDERS = (2, 3, 4, 5)
-MAX_TAIL = 3.5  # body radii; longer ones would fold the height field over itself
+MAX_TAIL = 3.5  # body radii
 _UNION_POWER = 12.0
+_TIP = 0.6  # width of a tail's end over that of its start
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,9 @@ class Drop:
 class _Rim:
     """Outline of a drop at TABLE equally spaced directions, metres, first entry repeated last."""
 
-    reach: Array  # centre to rim
-    support: Array  # centre to the rim's tangent line
+    reach: Array  # centre to rim, tail included
+    core: Array  # centre to rim, tail left out
+    support: Array  # centre to the tangent line of the core's rim
     body: float  # radius of the body, metres
 
 
@@ -65,10 +67,10 @@ def _circle_exit(phi: Array, dx: float, dy: float, r: float) -> Array:
     return along + np.sqrt(np.maximum(along**2 + r**2 - dx**2 - dy**2, 0.0))
 
 
-def _tail_exit(phi: Array, length: float, width: float, tilt: float) -> Array:
-    """Reach of the convex hull of a circle at the centre and a narrower one `length` above it."""
-    theta = np.abs((phi + np.pi / 2 - tilt + np.pi) % (2 * np.pi) - np.pi)
-    tip = 0.6 * width
+def _tail_exit(phi: Array, drop: Drop) -> Array:
+    """Reach of the convex hull of a circle at the centre and a narrower one at the tail's end."""
+    length, width, tip = drop.tail_length, drop.tail_width, _TIP * drop.tail_width
+    theta = np.abs((phi + np.pi / 2 - drop.tail_tilt + np.pi) % (2 * np.pi) - np.pi)
     gamma = np.arccos(np.clip((width - tip) / length, -1.0, 1.0))
     corner = np.arctan2(tip * np.sin(gamma), length + tip * np.cos(gamma))
     side = width / np.cos(np.minimum(np.abs(gamma - theta), 1.5))
@@ -76,10 +78,31 @@ def _tail_exit(phi: Array, length: float, width: float, tilt: float) -> Array:
     return np.where(theta >= gamma, width, np.where(theta >= corner, side, end))
 
 
+def _tail_height(drop: Drop, body: float, dx: Array, dy: Array) -> Array:
+    """Height of the run, metres: caps along its axis, negative outside."""
+    length, width = drop.tail_length, drop.tail_width
+    along = dx * np.sin(drop.tail_tilt) - dy * np.cos(drop.tail_tilt)
+    across = dx * np.cos(drop.tail_tilt) + dy * np.sin(drop.tail_tilt)
+    taper = (1 - _TIP) * width / length
+    # Foot of the normal to the hull's straight side, which leans inwards by `taper`.
+    lean = taper / np.sqrt(1 - taper**2)
+    foot = np.clip(along / body - np.abs(across) / body * lean, 0.0, length)
+    radius = (width - taper * foot) * body
+    level = np.hypot(across, along - foot * body) / radius
+    return radius * _profile(level, drop.contact_angle)
+
+
+def _profile(level: Array, contact_angle: float) -> Array:
+    """Cap of unit base radius: height over the distance from its axis, negative beyond 1."""
+    inverse = 1 / np.sin(contact_angle) ** 2
+    return np.sqrt(np.maximum(inverse - level**2, 0.0)) - np.sqrt(inverse - 1)
+
+
 def _rim(drop: Drop) -> _Rim:
     """Outline of the drop; the tables of its shape at unit radius are kept."""
     unit = _unit_rim(replace(drop, center=(0.0, 0.0), radius=1.0))
-    return _Rim(unit.reach * drop.radius, unit.support * drop.radius, unit.body * drop.radius)
+    r = drop.radius
+    return _Rim(unit.reach * r, unit.core * r, unit.support * r, unit.body * r)
 
 
 @lru_cache(maxsize=4096)
@@ -94,18 +117,19 @@ def _unit_rim(drop: Drop) -> _Rim:
         if dx * dx + dy * dy >= r * r:
             raise ValueError(f"lobe at ({dx}, {dy}) of radius {r} does not contain the centre")
         parts.append(_circle_exit(phi, dx, dy, r))
-    if drop.tail_length > 0:
-        parts.append(_tail_exit(phi, drop.tail_length, drop.tail_width, drop.tail_tilt))
-    reach = np.sum([part**_UNION_POWER for part in parts], axis=0) ** (1 / _UNION_POWER)
+    core = np.sum([part**_UNION_POWER for part in parts], axis=0) ** (1 / _UNION_POWER)
     wave = np.ones_like(phi)
     for order, (amplitude, phase) in zip(WOBBLE_ORDERS, drop.wobble, strict=False):
         wave += amplitude * np.cos(order * phi + phase)
-    reach = reach * np.maximum(wave, 0.3)
-    body = 1.0 / np.sqrt(np.mean(reach**2))
-    reach = reach * body
-    slope = (np.roll(reach, -1) - np.roll(reach, 1)) / (4 * np.pi / TABLE)
-    support = reach**2 / np.sqrt(reach**2 + slope**2)
-    return _Rim(np.append(reach, reach[0]), np.append(support, support[0]), float(body))
+    core = core * np.maximum(wave, 0.3)
+    full = core
+    if drop.tail_length > 0:
+        full = np.maximum(core, _tail_exit(phi, drop))
+    body = 1.0 / np.sqrt(np.mean(full**2))
+    slope = (np.roll(core, -1) - np.roll(core, 1)) / (4 * np.pi / TABLE)
+    support = core**2 / np.sqrt(core**2 + slope**2)
+    full, core, support = (np.append(table, table[0]) * body for table in (full, core, support))
+    return _Rim(full, core, support, float(body))
 
 
 def _lookup(table: Array, phi: Array) -> Array:
@@ -140,25 +164,33 @@ def height(drop: Drop, x: Array, y: Array) -> Array:
 
     The profile is that of a spherical cap, stretched to the outline: circles near the centre, the
     outline at the rim. Its slope at the rim is tan(contact_angle) times 1 + sag * sin(direction),
-    except at the end of a tail and where lobes reach further than the body, where it is lower
-    (the receding end of a run).
+    except where lobes reach much further than the body, where it is lower.
     """
+    return np.maximum(extended_height(drop, x, y), 0.0)
+
+
+def extended_height(drop: Drop, x: Array, y: Array) -> Array:
+    """As `height`, but falling below 0 just outside the rim, so that its slope can be measured."""
     rim = _rim(drop)
     dx = np.asarray(x, dtype=np.float64) - drop.center[0]
     dy = np.asarray(y, dtype=np.float64) - drop.center[1]
     distance = np.hypot(dx, dy)
     phi = np.arctan2(dy, dx)
-    edge = _lookup(rim.reach, phi)
+    edge = _lookup(rim.core, phi)
     rho = np.minimum(distance / edge, 1.0)
     # Zero slope of the blend at the rim keeps the slope of the profile there.
     blend = rho * rho * (3 - 2 * rho)
     level_radius = rim.body + (edge - rim.body) * blend
-    level = np.minimum(distance / level_radius, 1.0)
     rim_scale = np.minimum(_lookup(rim.support, phi), 1.25 * rim.body)
     scale = rim.body + (rim_scale - rim.body) * blend
-    lean = 1 + drop.sag * dy / level_radius
-    curve = np.sqrt(1 / np.sin(drop.contact_angle) ** 2 - level**2) - 1 / np.tan(drop.contact_angle)
-    return np.where(distance < edge, scale * lean * np.maximum(curve, 0.0), 0.0)
+    lean = 1 + drop.sag * dy / np.maximum(level_radius, distance)
+    core = scale * lean * _profile(distance / level_radius, drop.contact_angle)
+    if drop.tail_length <= 0:
+        return core
+    tail = _tail_height(drop, rim.body, dx, dy)
+    # A fillet where the run leaves the drop, inside both so that the outline stays.
+    fillet = 0.3 * np.maximum(np.minimum(core, tail), 0.0)
+    return np.maximum(core, tail) + fillet
 
 
 def mesh(drop: Drop, n_phi: int = 48, n_rho: int = 14) -> tuple[Array, NDArray[np.int64]]:
@@ -202,8 +234,8 @@ def sample_drop(
 ) -> Drop:
     """One random drop of the given place and size.
 
-    merged_share, run_share: probability of merged lobes and of a run above the drop, for large
-    drops; irregularity scales the outline's waves (0: round).
+    merged_share, run_share: probability of merged lobes and of a run above the drop;
+    irregularity scales the outline's waves (0: round).
     """
     falloff = np.array([0.09, 0.05, 0.03, 0.02]) * irregularity
     amplitude = falloff * rng.uniform(0.0, 1.0, 4)
@@ -294,7 +326,7 @@ def sample_drops(
     The share is measured on a raster with `resolution` pixels along the longer side and reached
     within `tolerance`. half_width, half_height, radius_range: metres. Radii follow a density
     r**-size_exponent (1: log-uniform). gap: metres kept free between drops. `shape` is passed to
-    sample_drop. Raises UserError if the share cannot be reached with drops of these sizes.
+    sample_drop; only drops beyond a fifth of the largest radius leave runs. Raises UserError if the share cannot be reached with drops of these sizes.
     """
     pitch = 2 * max(half_width, half_height) / resolution
     pad = int(np.ceil(4 * radius_range[1] / pitch)) + 4
@@ -314,7 +346,8 @@ def sample_drops(
         row, column = (int(center[k] / pitch + taken.shape[1 - k] / 2) for k in (1, 0))
         if taken[row, column]:
             continue
-        drop = sample_drop(rng, center, radius, **shape)  # type: ignore[arg-type]
+        details = shape if radius > 0.2 * radius_range[1] else {**shape, "run_share": 0.0}
+        drop = sample_drop(rng, center, radius, **details)  # type: ignore[arg-type]
         added = _place(taken, inside, drop, pitch, gap, coverage + 0.8 * tolerance - covered)
         if added > 0:
             covered += added
