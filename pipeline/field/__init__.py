@@ -1,0 +1,1 @@
+"""The radiance field: encodings, networks, samplers, volume rendering, losses, the fit."""

@@ -1,0 +1,75 @@
+"""What a fit and a render need of a radiance field: one small interface for every model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from pipeline.field.encoding import RowGradient
+
+
+class Rays(NamedTuple):
+    """Rays, components first: ``rays_o``, ``rays_d`` ``(3, R)``, ``near``, ``far`` ``(R,)``.
+
+    Directions have length 1 along their camera's optical axis: ``near`` and ``far`` are depths.
+    """
+
+    rays_o: Tensor
+    rays_d: Tensor
+    near: Tensor
+    far: Tensor
+
+
+class Rendering(NamedTuple):
+    """What rays see: ``rgb`` ``(R, 3)``, ``depth`` ``(R,)`` along z, ``opacity`` ``(R,)`` before the
+    background closes the ray, ``weights`` ``(R, S)`` of the intervals between ``edges`` ``(R, S+1)``.
+
+    ``edges`` are normalised positions along the ray: 0 near, 1 far.
+    """
+
+    rgb: Tensor
+    depth: Tensor
+    opacity: Tensor
+    weights: Tensor
+    edges: Tensor
+
+
+@dataclass(frozen=True)
+class Part:
+    """Parameters that are stepped together, with Adam's settings for them.
+
+    ``rate`` falls exponentially to ``rate * final`` over the fit, after ``warmup`` steps; ``every``
+    says how often the part has a gradient, after ``always_until`` steps.
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+    rate: float
+    final: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+    warmup: int = 0
+
+
+class Field(Protocol):
+    """A radiance field: rays in, colours and depths out, and a loss to fit it by."""
+
+    def render(self, rays: Rays) -> Rendering:
+        """What the rays see, without randomness."""
+
+    def loss(
+        self,
+        rays: Rays,
+        observed: Tensor,
+        drop_mask: Tensor,
+        step: int,
+        generator: torch.Generator,
+        sink: list[RowGradient],
+    ) -> tuple[Tensor, Tensor]:
+        """The loss to descend, and the plain photometric loss (eq. 4) within it."""
+
+    def parts(self) -> list[Part]:
+        """How each parameter is to be stepped; every parameter is in one part."""

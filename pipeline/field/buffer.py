@@ -1,0 +1,86 @@
+"""The pixels that a fit may use, shuffled, and the rays through them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.errors import UserError
+from pipeline.field.base import Rays
+from pipeline.geometry.rays import pixel_rays
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """One photo to fit: ``image`` ``(H, W, 3)`` in [0, 1], ``keep_mask`` ``(H, W)`` True = use,
+    ``cam_from_world`` ``(4, 4)``, ``intrinsics`` fx, fy, cx, cy, k1, and its depth bounds."""
+
+    name: str
+    image: np.ndarray
+    keep_mask: np.ndarray
+    cam_from_world: np.ndarray
+    intrinsics: tuple[float, float, float, float, float]
+    near: float
+    far: float
+
+
+class RayBuffer:
+    """Every kept pixel of every photo, in an order shuffled anew each epoch.
+
+    Covered pixels are not in it, so no ray is wasted on them. Holds 7 bytes per pixel; the rays
+    are made when a batch is asked for.
+    """
+
+    def __init__(self, photos: Sequence[PosedPhoto], seed: int, device: str = "cpu") -> None:
+        if not photos:
+            raise UserError("No photo is left to fit.", hint="check poses/poses.json")
+        kept, colours, offsets = [], [], [0]
+        for photo in photos:
+            kept.append(np.flatnonzero(photo.keep_mask.ravel()) + offsets[-1])
+            colours.append(np.round(photo.image.reshape(-1, 3) * 255.0).astype(np.uint8))
+            offsets.append(offsets[-1] + photo.keep_mask.size)
+        order = np.concatenate(kept).astype(np.int32)
+        if order.size == 0:
+            raise UserError(
+                "Every pixel of every photo is masked: nothing is left to fit.",
+                hint="raise masks.threshold or lower masks.dilation",
+            )
+        self.seed, self.device = seed, device
+        self.count = int(order.size)
+        self._kept = torch.from_numpy(order)
+        self._colours = torch.from_numpy(np.concatenate(colours)).to(device)
+        self._offsets = torch.tensor(offsets[1:])
+        self._starts = torch.tensor(offsets[:-1])
+        self._widths = torch.tensor([p.image.shape[1] for p in photos])
+        self._poses = _stack([p.cam_from_world[:3, :4] for p in photos])
+        self._intrinsics = _stack([np.array(p.intrinsics) for p in photos])
+        self._bounds = _stack([np.array([p.near, p.far]) for p in photos])
+        self._epoch = -1
+        self._shuffled = self._kept
+
+    def batch(self, step: int, size: int) -> tuple[Rays, Tensor]:
+        """The ``size`` rays of a step and their colours ``(R, 3)``; fewer if fewer are kept."""
+        size = min(size, self.count)
+        epoch, place = divmod(step, self.count // size)
+        if epoch != self._epoch:
+            generator = torch.Generator().manual_seed(self.seed * 100_003 + epoch)
+            order = torch.randperm(self.count, generator=generator, dtype=torch.int32)
+            self._shuffled, self._epoch = self._kept[order.long()], epoch
+        pixel = self._shuffled[place * size : (place + 1) * size].long()
+        view = torch.searchsorted(self._offsets, pixel, right=True)
+        inside = pixel - self._starts[view]
+        width = self._widths[view]
+        rows = torch.div(inside, width, rounding_mode="floor")
+        columns = inside - rows * width
+        rays_o, rays_d = pixel_rays(columns, rows, self._intrinsics[view], self._poses[view])
+        near, far = self._bounds[view].unbind(-1)
+        rays = Rays(*(v.to(self.device) for v in (rays_o, rays_d, near, far)))
+        return rays, self._colours[pixel.to(self.device)].float() / 255.0
+
+
+def _stack(arrays: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.stack(arrays).astype(np.float32))

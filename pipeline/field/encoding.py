@@ -1,0 +1,188 @@
+"""Where a field keeps what it knows: grids of features, and encodings of position and direction.
+
+The multiresolution hash grid is that of Instant NGP (doi:10.1145/3528223.3530127). On a CPU its
+cost is reading and adding to table rows at random: reading is one ``embedding_bag`` per level,
+adding one product with a sparse matrix, both of which run without a compiler and let other threads
+work meanwhile.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.sparse import csc_array
+from torch import Tensor, nn
+
+HASH_PRIMES = (1, 2654435761 - 2**32, 805459861)
+
+
+class RowGradient(NamedTuple):
+    """A gradient of a table, not yet added up: rows, their weights and the samples' gradients."""
+
+    table: str
+    rows: Tensor
+    weights: Tensor
+    gradient: Tensor
+
+
+def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tuple[Tensor, Tensor]:
+    """Table rows ``(N, 8)`` int32 of the corners around each point and their trilinear weights.
+
+    ``x`` ``(3, N)`` in [0, 1]; ``resolution`` counts the grid's vertices per axis. A level whose
+    vertices fit into ``size`` rows (a power of two) is indexed directly, others are hashed.
+    """
+    dense = math.prod(resolution) <= size
+    steps = (1, resolution[0], resolution[0] * resolution[1]) if dense else HASH_PRIMES
+    ids, weights = [], []
+    for axis in range(3):
+        position = x[axis] * (resolution[axis] - 1)
+        cell = position.floor().clamp_(max=resolution[axis] - 2)
+        upper = position - cell
+        first = cell.to(torch.int32) * steps[axis]
+        ids.append(torch.stack([first, first + steps[axis]]))
+        weights.append(torch.stack([1.0 - upper, upper]))
+    a, b, c = ids[0][:, None, None], ids[1][None, :, None], ids[2][None, None, :]
+    rows = a + b + c if dense else (a ^ b ^ c) & (size - 1)
+    w = (weights[0][:, None] * weights[1][None])[:, :, None] * weights[2][None, None]
+    return rows.view(8, -1).t().contiguous(), w.view(8, -1).t().contiguous()
+
+
+def add_rows(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
+    """``(size, F)`` with ``weights[n, k] * gradient[n]`` added into row ``rows[n, k]``.
+
+    On a CPU the product of a sparse matrix, one column per sample, with the gradient: one pass in
+    the order of the samples, so the same sums every time.
+    """
+    if rows.device.type != "cpu":
+        expanded = (weights[..., None] * gradient[:, None]).flatten(0, 1)
+        out = torch.zeros(size, gradient.shape[1], device=rows.device, dtype=gradient.dtype)
+        return out.index_add_(0, rows.flatten(), expanded)
+    count, per_sample = rows.shape
+    starts = np.arange(0, count * per_sample + 1, per_sample, dtype=np.int32)
+    matrix = csc_array(
+        (weights.detach().numpy().ravel(), rows.numpy().ravel(), starts), shape=(size, count)
+    )
+    return torch.from_numpy(matrix @ gradient.contiguous().numpy())
+
+
+class _Gather(torch.autograd.Function):
+    """Weighted sums of table rows; the backward pass adds, or leaves the adding to the sink."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        table: Tensor,
+        rows: Tensor,
+        weights: Tensor,
+        name: str,
+        sink: list[RowGradient] | None,
+    ) -> Tensor:
+        ctx.save_for_backward(rows, weights)
+        ctx.name, ctx.sink, ctx.size = name, sink, table.shape[0]
+        return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+        rows, weights = ctx.saved_tensors
+        if ctx.sink is None:
+            return add_rows(rows, weights, gradient, ctx.size), None, None, None, None
+        ctx.sink.append(RowGradient(ctx.name, rows, weights, gradient))
+        return None, None, None, None, None
+
+
+def gather(
+    table: Tensor,
+    rows: Tensor,
+    weights: Tensor,
+    name: str = "",
+    sink: list[RowGradient] | None = None,
+) -> Tensor:
+    """``sum_k weights[n, k] * table[rows[n, k]]``, ``(N, F)``, differentiable in ``table``.
+
+    With a ``sink`` the table's gradient is not formed: the rows to add go into the list, under
+    ``name``, so that a fit can add up several batches at once, one table per thread.
+    """
+    return _Gather.apply(table, rows, weights, name, sink)
+
+
+def level_resolutions(
+    coarse: tuple[int, int, int], fine: tuple[int, int, int], levels: int
+) -> list[tuple[int, int, int]]:
+    """Vertices per axis of each level: a geometric sequence from coarse to fine."""
+    if levels == 1:
+        return [fine]
+    out = []
+    for level in range(levels):
+        share = level / (levels - 1)
+        sizes = [round(c * (f / c) ** share) for c, f in zip(coarse, fine, strict=True)]
+        out.append((sizes[0], sizes[1], sizes[2]))
+    return out
+
+
+class HashGrid(nn.Module):
+    """A multiresolution grid of features: ``(3, N)`` points in [0, 1] to ``(N, levels * features)``.
+
+    ``size_log2`` bounds the rows of a level's table. Deterministic for a given generator.
+    """
+
+    def __init__(
+        self,
+        resolutions: list[tuple[int, int, int]],
+        features: int,
+        size_log2: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.resolutions = resolutions
+        self.sizes = [min(2**size_log2, _power_of_two(math.prod(r))) for r in resolutions]
+        self.tables = nn.ParameterList(
+            nn.Parameter(torch.empty(size, features).uniform_(-1e-4, 1e-4, generator=generator))
+            for size in self.sizes
+        )
+
+    def forward(
+        self, x: Tensor, prefix: str = "", sink: list[RowGradient] | None = None
+    ) -> Tensor:
+        parts = []
+        for level, table in enumerate(self.tables):
+            rows, weights = cell_corners(x, self.resolutions[level], self.sizes[level])
+            parts.append(gather(table, rows, weights, f"{prefix}tables.{level}", sink))
+        return torch.cat(parts, dim=1)
+
+
+def _power_of_two(count: int) -> int:
+    return 1 << max(0, (count - 1).bit_length())
+
+
+def spherical_harmonics(directions: Tensor) -> Tensor:
+    """The nine real spherical harmonics up to degree 2, ``(R, 9)``, of directions ``(3, R)``."""
+    x, y, z = (directions / torch.linalg.vector_norm(directions, dim=0)).unbind(0)
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479),
+            0.48860251 * y,
+            0.48860251 * z,
+            0.48860251 * x,
+            1.09254843 * x * y,
+            1.09254843 * y * z,
+            0.31539157 * (3.0 * z * z - 1.0),
+            1.09254843 * x * z,
+            0.54627422 * (x * x - y * y),
+        ],
+        dim=1,
+    )
+
+
+def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
+    """``(x, sin(2^k x), cos(2^k x))`` for k below ``frequencies``: ``(N, C)`` to ``(N, C(1+2k))``.
+
+    NeRF, doi:10.1145/3503250, eq. 4, without its factor pi and with x itself, as its code has it.
+    """
+    parts = [x]
+    for k in range(frequencies):
+        parts += [torch.sin(x * 2.0**k), torch.cos(x * 2.0**k)]
+    return torch.cat(parts, dim=-1)

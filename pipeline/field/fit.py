@@ -1,0 +1,271 @@
+"""The fit: rays of kept pixels in, parameters stepped; the same bytes for the same seed on a CPU.
+
+A batch is cut into a fixed number of shards that run in threads, each on one core; then every
+table's gradient is added up and stepped in a thread of its own. Nothing depends on how many
+threads there are, only the time does.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.errors import UserError
+from pipeline.field.base import Field, Part, Rays
+from pipeline.field.buffer import RayBuffer
+from pipeline.field.encoding import RowGradient, add_rows
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+Progress = Callable[[int, float, float], None]
+Save = Callable[[int, dict[str, Tensor]], None]
+
+
+@dataclass
+class Record:
+    """The course of a fit: step, loss and training PSNR in dB, averaged since the row before."""
+
+    rows: list[tuple[int, float, float]] = field(default_factory=list)
+
+
+class Stepper:
+    """Adam for one part of a field, at a rate that depends on the step alone."""
+
+    def __init__(self, part: Part, parameters: list[nn.Parameter], steps: int) -> None:
+        self.part, self.parameters, self.steps = part, parameters, steps
+        self.adam = torch.optim.Adam(
+            parameters, lr=part.rate, betas=part.betas, eps=part.eps, fused=True
+        )
+
+    def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
+        """One step with the given gradients; none at all leaves the part as it is."""
+        if all(gradient is None for gradient in gradients):
+            return
+        rate = self.part.rate * self.part.final ** (step / self.steps)
+        if self.part.warmup:
+            rate *= min(1.0, (step + 1) / self.part.warmup)
+        self.adam.param_groups[0]["lr"] = rate
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.adam.step()
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def state(self) -> dict[str, Tensor]:
+        """Adam's running moments by name; what :meth:`restore` takes back."""
+        out = {}
+        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
+            for key, value in self.adam.state[parameter].items():
+                out[f"{key}:{name}"] = value
+        return out
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continue from :meth:`state`."""
+        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
+            for key in ("step", "exp_avg", "exp_avg_sq"):
+                if f"{key}:{name}" in state:
+                    self.adam.state[parameter][key] = state[f"{key}:{name}"].clone()
+
+
+def fit(
+    model: nn.Module,
+    buffer: RayBuffer,
+    *,
+    steps: int,
+    batch_rays: int,
+    seed: int,
+    shards: int = 2,
+    threads: int = 2,
+    log_every: int = 50,
+    save_every: int = 0,
+    save: Save | None = None,
+    resume: tuple[int, dict[str, Tensor]] | None = None,
+    progress: Progress | None = None,
+) -> Record:
+    """Fit ``model`` (a :class:`Field`) in place; the course of it comes out.
+
+    ``shards`` pieces of each batch run side by side on up to ``threads`` cores: the shards decide
+    the bytes, the threads do not. ``save(step, state)`` is called every ``save_every`` steps;
+    ``resume`` takes such a pair and goes on to the same bytes. ``progress(step, loss, psnr)``.
+    Raises UserError when the loss is not finite.
+    """
+    steppers = _steppers(model, steps)
+    record = Record()
+    first = 0
+    if resume is not None:
+        first = _restore(model, steppers, record, resume)
+    running: list[Tensor] = []
+    with _pool(threads, buffer.device) as pool:
+        for step in range(first, steps):
+            rays, observed = buffer.batch(step, batch_rays)
+            losses = _one_step(model, steppers, rays, observed, step, seed, shards, pool)
+            running.append(losses)
+            done = step + 1
+            if done % log_every == 0 or done == steps:
+                loss, photometric = torch.stack(running).mean(0).tolist()
+                _check_finite(loss, step)
+                psnr = -10.0 * math.log10(max(photometric, 1e-12))
+                record.rows.append((done, loss, psnr))
+                running.clear()
+                if progress is not None:
+                    progress(done, loss, psnr)
+            if save is not None and save_every and done % save_every == 0 and done < steps:
+                save(done, _state(model, steppers, record, running))
+    return record
+
+
+def _one_step(
+    model: nn.Module,
+    steppers: list[Stepper],
+    rays: Rays,
+    observed: Tensor,
+    step: int,
+    seed: int,
+    shards: int,
+    pool: Executor | None,
+) -> Tensor:
+    """Gradients of every shard, then a step of every part; (loss, photometric loss) comes out."""
+    dense = [
+        (name, parameter)
+        for stepper in steppers
+        for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
+    ]
+    pieces = _cut(rays, observed, shards)
+    total = observed.shape[0]
+
+    def shard(number: int) -> tuple[Tensor, dict[str, Tensor | None], list[RowGradient]]:
+        piece, colours = pieces[number]
+        share = colours.shape[0] / total
+        source = torch.Generator(colours.device)
+        source.manual_seed((seed * 1_000_003 + step) * 64 + number)
+        sink: list[RowGradient] = []
+        keep_all = torch.zeros(colours.shape[0], device=colours.device)
+        loss, photometric = _as_field(model).loss(piece, colours, keep_all, step, source, sink)
+        gradients = torch.autograd.grad(
+            loss * share, [parameter for _, parameter in dense], allow_unused=True
+        )
+        names = [name for name, _ in dense]
+        both = torch.stack([loss.detach(), photometric.detach()]) * share
+        return both, dict(zip(names, gradients, strict=True)), sink
+
+    done = _map(pool, shard, len(pieces))
+
+    def advance(number: int) -> None:
+        stepper = steppers[number]
+        gradients = [
+            _total(name, parameter, done)
+            for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
+        ]
+        stepper.step(step, gradients)
+
+    _map(pool, advance, len(steppers))
+    return torch.stack([both for both, _, _ in done]).sum(0)
+
+
+def _total(
+    name: str,
+    parameter: nn.Parameter,
+    done: list[tuple[Tensor, dict[str, Tensor | None], list[RowGradient]]],
+) -> Tensor | None:
+    """One parameter's gradient over all shards, added in a fixed order."""
+    rows = [entry for _, _, sink in done for entry in sink if entry.table == name]
+    if rows:
+        return add_rows(
+            torch.cat([entry.rows for entry in rows]),
+            torch.cat([entry.weights for entry in rows]),
+            torch.cat([entry.gradient for entry in rows]),
+            parameter.shape[0],
+        )
+    parts = [gradients[name] for _, gradients, _ in done]
+    found = [part for part in parts if part is not None]
+    return torch.stack(found).sum(0) if found else None
+
+
+def _cut(rays: Rays, observed: Tensor, shards: int) -> list[tuple[Rays, Tensor]]:
+    """The batch in ``shards`` nearly equal pieces, none empty."""
+    cuts = [t.chunk(shards, dim=-1) for t in rays]
+    return [
+        (Rays(*(c[i].contiguous() for c in cuts)), colours)
+        for i, colours in enumerate(observed.chunk(shards, dim=0))
+    ]
+
+
+def _map(pool: Executor | None, function: Callable[[int], T], count: int) -> list[T]:
+    if pool is None:
+        return [function(i) for i in range(count)]
+    return list(pool.map(function, range(count)))
+
+
+@contextmanager
+def _pool(threads: int, device: str) -> Iterator[Executor | None]:
+    """Threads for the shards, one core each: torch's own threads lose on work this small."""
+    if device != "cpu":
+        yield None
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        if threads <= 1:
+            yield None
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                yield pool
+    finally:
+        torch.set_num_threads(before)
+
+
+def _as_field(model: nn.Module) -> Field:
+    return model  # type: ignore[return-value]
+
+
+def _steppers(model: nn.Module, steps: int) -> list[Stepper]:
+    named = dict(model.named_parameters())
+    parts = _as_field(model).parts()
+    listed = sorted(name for part in parts for name in part.parameters)
+    if listed != sorted(named):
+        raise ValueError("every parameter of a field must be in exactly one part")
+    return [Stepper(part, [named[name] for name in part.parameters], steps) for part in parts]
+
+
+def _check_finite(loss: float, step: int) -> None:
+    if not math.isfinite(loss):
+        raise UserError(
+            f"The fit broke down near step {step}: its loss is {loss}.",
+            hint="lower nerf.rate, or change nerf.seed",
+        )
+
+
+def _state(
+    model: nn.Module, steppers: list[Stepper], record: Record, running: list[Tensor]
+) -> dict[str, Tensor]:
+    state = {f"model:{name}": value.detach() for name, value in model.named_parameters()}
+    for stepper in steppers:
+        state |= stepper.state()
+    state["record"] = torch.tensor(record.rows, dtype=torch.float64).reshape(-1, 3)
+    return state
+
+
+def _restore(
+    model: nn.Module,
+    steppers: list[Stepper],
+    record: Record,
+    resume: tuple[int, dict[str, Tensor]],
+) -> int:
+    step, state = resume
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            parameter.copy_(state[f"model:{name}"])
+    for stepper in steppers:
+        stepper.restore(state)
+    record.rows = [(int(a), b, c) for a, b, c in state["record"].tolist()]
+    return step

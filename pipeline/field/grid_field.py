@@ -1,0 +1,185 @@
+"""The fast field: a hash grid, a small network, and a proposal grid that finds the surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.field.base import Part, Rays, Rendering
+from pipeline.field.encoding import (
+    HashGrid,
+    RowGradient,
+    gather,
+    level_resolutions,
+    spherical_harmonics,
+)
+from pipeline.field.losses import distortion_loss, masked_photometric_loss, proposal_loss
+from pipeline.field.sampling import depth_at, intervals_around, invert_histogram, stratified
+from pipeline.field.volume import composite, render_weights
+from pipeline.geometry.spaces import Space
+
+SHAPE_OUTPUTS = 16
+MAX_LOG_DENSITY = 12.0
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """Sizes of the fast field; what a fitted file has to repeat to be read back."""
+
+    levels: int = 4
+    features: int = 8
+    table_log2: int = 17
+    coarse: tuple[int, int, int] = (24, 18, 16)
+    fine: tuple[int, int, int] = (512, 384, 128)
+    hidden: int = 64
+    samples: int = 8
+    bins: int = 32
+    proposal: tuple[int, int, int] = (96, 72, 64)
+    distortion: float = 0.0
+
+
+class GridField(nn.Module):
+    """Position to density and features through the grid; features along the ray to colour.
+
+    The features are summed along each ray first and the colour network runs once per ray, with the
+    viewing direction, instead of once per sample.
+    """
+
+    def __init__(self, config: GridConfig, space: Space, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.config, self.space = config, space
+        resolutions = level_resolutions(config.coarse, config.fine, config.levels)
+        self.grid = HashGrid(resolutions, config.features, config.table_log2, generator)
+        self.proposal = nn.Parameter(torch.zeros(_cells(config.proposal), 1))
+        width = config.levels * config.features
+        self.shape_in = _linear(width, config.hidden, generator)
+        self.shape_out = _linear(config.hidden, SHAPE_OUTPUTS, generator)
+        self.colour_in = _linear(SHAPE_OUTPUTS - 1 + 9, config.hidden, generator)
+        self.colour_mid = _linear(config.hidden, config.hidden, generator)
+        self.colour_out = _linear(config.hidden, 3, generator)
+
+    def render(self, rays: Rays) -> Rendering:
+        """See :class:`pipeline.field.base.Field`."""
+        with torch.no_grad():
+            proposed, _ = self._propose(rays, None, None)
+            return self._shade(rays, proposed, None, None)
+
+    def loss(
+        self,
+        rays: Rays,
+        observed: Tensor,
+        drop_mask: Tensor,
+        step: int,
+        generator: torch.Generator,
+        sink: list[RowGradient],
+    ) -> tuple[Tensor, Tensor]:
+        """See :class:`pipeline.field.base.Field`."""
+        learn_proposal = step < 200 or step % 4 == 0
+        with torch.set_grad_enabled(learn_proposal):
+            proposed, table_rows = self._propose(rays, generator, sink)
+        out = self._shade(rays, proposed.detach(), generator, sink)
+        photometric = masked_photometric_loss(out.rgb, observed, drop_mask)
+        total = photometric
+        if learn_proposal:
+            total = total + proposal_loss(out.edges, out.weights, proposed)
+        if self.config.distortion > 0.0:
+            total = total + self.config.distortion * distortion_loss(out.edges, out.weights)
+        return total, photometric
+
+    def parts(self) -> list[Part]:
+        """See :class:`pipeline.field.base.Field`."""
+        betas = (0.9, 0.99)
+        tables = [
+            Part(f"grid.tables.{i}", (f"grid.tables.{i}",), 2e-2, 0.03, betas, 1e-15, 50)
+            for i in range(len(self.grid.tables))
+        ]
+        head = tuple(
+            name for name, _ in self.named_parameters() if name.startswith(("shape", "colour"))
+        )
+        return [
+            *tables,
+            Part("proposal", ("proposal",), 1e-1, 0.1, betas, 1e-15, 50),
+            Part("head", head, 3e-3, 0.03, betas, 1e-8, 50),
+        ]
+
+    def _propose(
+        self, rays: Rays, generator: torch.Generator | None, sink: list[RowGradient] | None
+    ) -> tuple[Tensor, None]:
+        """The proposal's weights ``(R, B)`` in equal bins of normalised depth."""
+        bins, sizes = self.config.bins, self.config.proposal
+        count = rays.near.shape[0]
+        edges = torch.linspace(0, 1, bins + 1, device=rays.near.device)
+        walk = self._walk(rays, edges.expand(count, -1))
+        step = walk[:, :, 1:] - walk[:, :, :-1]
+        delta = torch.linalg.vector_norm(step, dim=0)
+        if generator is None:
+            x = walk[:, :, :-1] + 0.5 * step
+        else:
+            noise = torch.rand(count, bins, generator=generator, device=delta.device)
+            x = walk[:, :, :-1] + noise * step
+        x = x.reshape(3, -1)
+        row = torch.zeros(x.shape[1], dtype=torch.int32, device=x.device)
+        stride = 1
+        for axis in range(3):
+            place = x[axis] * sizes[axis]
+            if generator is not None:
+                # Half a cell of noise: on average the nearest cell is the trilinear mixture.
+                place = place + torch.rand(
+                    place.shape, generator=generator, device=place.device
+                ) - 0.5
+            cell = place.to(torch.int32).clamp_(0, sizes[axis] - 1)
+            row += cell * stride
+            stride *= sizes[axis]
+        ones = torch.ones_like(x[0])[:, None]
+        raw = gather(self.proposal, row[:, None], ones, "proposal", sink)
+        sigma = torch.exp(raw.view(count, bins).clamp_max(MAX_LOG_DENSITY))
+        return render_weights(sigma, delta, opaque_last=True), None
+
+    def _shade(
+        self,
+        rays: Rays,
+        proposed: Tensor,
+        generator: torch.Generator | None,
+        sink: list[RowGradient] | None,
+    ) -> Rendering:
+        """Colours and depths from samples where the proposal has its weight."""
+        count, samples = rays.near.shape[0], self.config.samples
+        u = stratified(count, samples, generator, rays.near)
+        edges = intervals_around(invert_histogram(proposed + 0.01 / self.config.bins, u))
+        walk = self._walk(rays, edges)
+        delta = torch.linalg.vector_norm(walk[:, :, 1:] - walk[:, :, :-1], dim=0)
+        x = 0.5 * (walk[:, :, 1:] + walk[:, :, :-1])
+        features = self.grid(x.reshape(3, -1), "grid.", sink)
+        shape = self.shape_out(torch.relu(self.shape_in(features))).view(count, samples, -1)
+        sigma = torch.exp(shape[..., 0].clamp_max(MAX_LOG_DENSITY))
+        weights = render_weights(sigma, delta, opaque_last=True)
+        seen = composite(weights, shape)[:, 1:]
+        hidden = torch.cat([seen, spherical_harmonics(rays.rays_d)], dim=1)
+        hidden = torch.relu(self.colour_mid(torch.relu(self.colour_in(hidden))))
+        rgb = torch.sigmoid(self.colour_out(hidden))
+        with torch.no_grad():
+            middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+            depth = depth_at((weights * middle).sum(-1), rays.near, rays.far)
+            opacity = 1.0 - torch.exp(-(sigma * delta).sum(-1))
+        return Rendering(rgb, depth, opacity, weights, edges)
+
+    def _walk(self, rays: Rays, edges: Tensor) -> Tensor:
+        """Unit-cube positions ``(3, R, K)`` of normalised depths ``(R, K)`` along the rays."""
+        t = depth_at(edges, rays.near[:, None], rays.far[:, None])
+        return self.space.warp(rays.rays_o[:, :, None] + rays.rays_d[:, :, None] * t)
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    with torch.no_grad():
+        bound = (6.0 / inputs) ** 0.5
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.zero_()
+    return layer
+
+
+def _cells(sizes: tuple[int, int, int]) -> int:
+    return sizes[0] * sizes[1] * sizes[2]

@@ -1,0 +1,56 @@
+"""Whole images from a field, in chunks of bounded memory."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from pipeline.field.base import Field, Rays
+from pipeline.geometry.rays import pixel_rays
+
+CHUNK = 8192
+
+
+class RenderedView(NamedTuple):
+    """``rgb`` ``(H, W, 3)`` in [0, 1], ``depth`` and ``opacity`` ``(H, W)``; float32."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    opacity: np.ndarray
+
+
+def render_view(
+    field: Field,
+    cam_from_world: np.ndarray,
+    intrinsics: tuple[float, float, float, float, float],
+    size: tuple[int, int],
+    near: float,
+    far: float,
+    *,
+    device: str = "cpu",
+    chunk: int = CHUNK,
+) -> RenderedView:
+    """One view of the field. ``size`` is (width, height); depth is along z, in the poses' unit.
+
+    ``intrinsics`` are fx, fy, cx, cy, k1. Memory is bounded by ``chunk`` rays. The same bytes for
+    the same chunk, whatever runs beside it.
+    """
+    width, height = size
+    pose = torch.from_numpy(np.asarray(cam_from_world, np.float32)[:3, :4]).to(device)
+    camera = torch.tensor(intrinsics, dtype=torch.float32, device=device)
+    parts = []
+    for start in range(0, width * height, chunk):
+        pixel = torch.arange(start, min(start + chunk, width * height), device=device)
+        rows = torch.div(pixel, width, rounding_mode="floor")
+        rays_o, rays_d = pixel_rays(pixel - rows * width, rows, camera, pose)
+        bounds = [torch.full_like(rays_d[0], value) for value in (near, far)]
+        out = field.render(Rays(rays_o.contiguous(), rays_d, *bounds))
+        parts.append(torch.cat([out.rgb, out.depth[:, None], out.opacity[:, None]], 1).cpu())
+    pixels = torch.cat(parts).view(height, width, 5).numpy()
+    return RenderedView(
+        np.ascontiguousarray(pixels[..., :3]),
+        np.ascontiguousarray(pixels[..., 3]),
+        np.ascontiguousarray(pixels[..., 4]),
+    )

@@ -1,0 +1,57 @@
+"""Where along a ray a field is asked: depth spacing, and samples drawn from a histogram."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def depth_at(s: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """Depth t of the normalised position ``s`` in [0, 1]: linear in inverse depth.
+
+    ``near`` and ``far`` broadcast against ``s``; s = 0 is near, s = 1 is far.
+    """
+    return 1.0 / (1.0 / near + s * (1.0 / far - 1.0 / near))
+
+
+def invert_histogram(weights: Tensor, u: Tensor) -> Tensor:
+    """Positions in [0, 1] whose cumulative weight is ``u``.
+
+    ``weights`` ``(R, B)``, non-negative, of B equal bins of [0, 1]; ``u`` ``(R, K)`` in [0, 1],
+    sorted along the last axis: the result is sorted too. A ray without any weight is taken as
+    uniform.
+    """
+    bins = weights.shape[-1]
+    cdf = torch.cumsum(weights + 1e-6, dim=-1)
+    cdf = cdf / cdf[:, -1:]
+    # The bin whose upper edge is the first to reach u.
+    index = torch.searchsorted(cdf, u.contiguous()).clamp_max(bins - 1)
+    upper = torch.gather(cdf, 1, index)
+    lower = torch.where(index > 0, torch.gather(cdf, 1, (index - 1).clamp_min(0)), 0.0)
+    inside = ((u - lower) / (upper - lower).clamp_min(1e-12)).clamp(0.0, 1.0)
+    return (index + inside) / bins
+
+
+def stratified(
+    rays: int, count: int, generator: torch.Generator | None, like: Tensor
+) -> Tensor:
+    """``(rays, count)`` increasing numbers in [0, 1], one per equal stratum.
+
+    Random within each stratum with a generator, in its middle without one.
+    """
+    base = torch.arange(count, dtype=like.dtype, device=like.device)
+    if generator is None:
+        return ((base + 0.5) / count).expand(rays, count)
+    noise = torch.rand(rays, count, generator=generator, dtype=like.dtype, device=like.device)
+    return (base + noise) / count
+
+
+def intervals_around(s: Tensor) -> Tensor:
+    """Edges ``(R, K+1)`` of intervals around sorted positions ``s`` ``(R, K)``.
+
+    Half-way between neighbours; the outer ones mirror the first and the last gap, within [0, 1].
+    """
+    middle = 0.5 * (s[:, 1:] + s[:, :-1])
+    first = (2.0 * s[:, :1] - middle[:, :1]).clamp_min(0.0)
+    last = (2.0 * s[:, -1:] - middle[:, -1:]).clamp_max(1.0)
+    return torch.cat([first, middle, last], dim=1)
