@@ -1,0 +1,1 @@
+"""The attentive-recurrent drop detector: network, inference and training."""
