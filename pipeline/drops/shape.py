@@ -100,15 +100,15 @@ def _profile(level: Array, contact_angle: float) -> Array:
 
 def _rim(drop: Drop) -> _Rim:
     """Outline of the drop; the tables of its shape at unit radius are kept."""
-    unit = _unit_rim(replace(drop, center=(0.0, 0.0), radius=1.0))
+    if not 0 < drop.contact_angle < np.pi / 2:
+        raise ValueError(f"contact angle {drop.contact_angle} rad is not within (0, pi/2)")
+    unit = _unit_rim(replace(drop, center=(0.0, 0.0), radius=1.0, contact_angle=1.0, sag=0.0))
     r = drop.radius
     return _Rim(unit.reach * r, unit.core * r, unit.support * r, unit.body * r)
 
 
 @lru_cache(maxsize=4096)
 def _unit_rim(drop: Drop) -> _Rim:
-    if not 0 < drop.contact_angle < np.pi / 2:
-        raise ValueError(f"contact angle {drop.contact_angle} rad is not within (0, pi/2)")
     if drop.tail_length > MAX_TAIL:
         raise ValueError(f"tail of {drop.tail_length} body radii is longer than {MAX_TAIL}")
     phi = np.linspace(0.0, 2 * np.pi, TABLE, endpoint=False)
@@ -326,7 +326,8 @@ def sample_drops(
     The share is measured on a raster with `resolution` pixels along the longer side and reached
     within `tolerance`. half_width, half_height, radius_range: metres. Radii follow a density
     r**-size_exponent (1: log-uniform). gap: metres kept free between drops. `shape` is passed to
-    sample_drop; only drops beyond a fifth of the largest radius leave runs. Raises UserError if the share cannot be reached with drops of these sizes.
+    sample_drop; only drops beyond a fifth of the largest radius leave runs. Raises
+    UserError if the share cannot be reached with drops of these sizes.
     """
     pitch = 2 * max(half_width, half_height) / resolution
     pad = int(np.ceil(4 * radius_range[1] / pitch)) + 4

@@ -1,0 +1,125 @@
+"""Training pairs for a drop detector: a rainy photograph and the coverage painted onto it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.drops.optics import Image, linear_to_srgb, srgb_to_linear
+from pipeline.drops.painter import paint, scatter
+
+CLEAN_SHARE = 0.08
+
+
+def sample_pair(
+    rng: np.random.Generator, background: Image, *, clean_share: float = CLEAN_SHARE
+) -> tuple[Image, NDArray[np.float32]]:
+    """A rainy image (H, W, 3) and its soft coverage (H, W), everything about the rain drawn.
+
+    background: (H, W, 3) float32 sRGB in [0, 1], at least 32 pixels a side. The coverage is the
+    alpha of the composition; with probability clean_share there is no water and it is all zero,
+    while the image still goes through glass, noise and compression.
+    """
+    height, width = background.shape[:2]
+    image = through_glass(rng, background)
+    coverage = np.zeros((height, width), np.float32)
+    if rng.random() >= clean_share:
+        image, coverage = _wet(rng, image)
+    return through_camera(rng, image), coverage
+
+
+def _wet(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.float32]]:
+    height, width = image.shape[:2]
+    side = max(height, width)
+    largest = float(np.exp(rng.uniform(np.log(3.0), np.log(0.17 * side))))
+    if rng.random() < 0.06:
+        largest = float(rng.uniform(0.17, 0.35) * side)
+    smallest = max(largest * rng.uniform(0.05, 0.6), 0.8)
+    kind = rng.random()
+    if kind < 0.35:
+        blur = float(rng.uniform(0.0, 1.5))  # the pane is (nearly) in focus
+    elif kind < 0.7:
+        blur = float(rng.uniform(0.1, 0.8) * largest)
+    else:
+        blur = float(rng.uniform(0.6, 1.8) * largest)  # a window close to the lens
+    blur = min(blur, 44.0)
+    # Drops much smaller than the disc of confusion leave nothing visible.
+    smallest = max(smallest, 0.3 * blur)
+    largest = max(largest, 1.3 * smallest)
+    focal = float(side * np.exp(rng.uniform(np.log(0.7), np.log(4.0))))
+    drops = scatter(
+        rng,
+        (height, width),
+        float(np.exp(rng.uniform(np.log(0.03), np.log(0.40)))),
+        (smallest, largest),
+        size_exponent=float(rng.uniform(0.5, 3.0)),
+        margin=0.5 * blur,
+    )
+    return paint(
+        image,
+        drops,
+        focal_px=focal,
+        pane_distance=focal,  # one metre per pixel: only angles matter here
+        aperture_radius=blur / 2,
+        highlight=float(rng.uniform(0.0, 5.0)),
+        sky_gain=float(np.exp(rng.uniform(np.log(0.7), np.log(4.0)))),
+        rim_light=float(rng.uniform(0.15, 0.7)),
+        surroundings=_surroundings(rng),
+    )
+
+
+def _surroundings(rng: np.random.Generator) -> Image:
+    """Factors about 1, smooth and coarse: buildings, trees and gaps beyond the photo's border."""
+    factors = np.ones((64, 64, 3), np.float32)
+    for cells, strength in ((4, 0.35), (12, 0.3), (32, 0.25)):
+        grey = rng.normal(0, 1, (cells, cells, 1)) + 0.25 * rng.normal(0, 1, (cells, cells, 3))
+        interpolation = cv2.INTER_NEAREST if rng.random() < 0.4 else cv2.INTER_CUBIC
+        factors += (
+            float(rng.uniform(0, strength))
+            * cv2.resize(grey.astype(np.float32), (64, 64), interpolation=interpolation)
+        ).astype(np.float32)
+    return np.clip(factors, 0.15, 2.5)
+
+
+def through_glass(rng: np.random.Generator, image: Image) -> Image:
+    """The photo through a dry pane: sometimes veiled, hazy, or blurred as by condensation."""
+    light = srgb_to_linear(image) * np.float32(np.exp(rng.normal(0.0, 0.25)))
+    if rng.random() < 0.35:
+        light = cv2.GaussianBlur(light, (0, 0), float(rng.uniform(0.3, 1.3)))
+    if rng.random() < 0.4:
+        coarse = cv2.resize(
+            rng.uniform(0.3, 1.0, (3, 3)).astype(np.float32),
+            (image.shape[1], image.shape[0]),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        veil = np.float32(rng.uniform(0.0, 0.3)) * coarse[..., None]
+        tint = (light.mean(axis=(0, 1)) + rng.uniform(0.2, 0.7)) / 2
+        light = light * (1 - veil) + veil * tint.astype(np.float32)
+    return linear_to_srgb(light)
+
+
+def through_camera(rng: np.random.Generator, image: Image) -> Image:
+    """Sensor noise, white balance, tone, resampling blur or sharpening, and JPEG, each at times."""
+    out = image
+    if rng.random() < 0.3:
+        out = out * rng.uniform(0.9, 1.1, 3).astype(np.float32)
+    if rng.random() < 0.3:
+        out = np.clip(out, 0, 1) ** np.float32(np.exp(rng.normal(0, 0.2)))
+    if rng.random() < 0.3:
+        soft = cv2.GaussianBlur(out, (0, 0), float(rng.uniform(0.4, 1.2)))
+        # A negative amount sharpens, as cameras do.
+        out = out + np.float32(rng.uniform(-0.8, 1.0)) * (soft - out)
+    if rng.random() < 0.7:
+        spread = rng.uniform(0.001, 0.025)
+        shot = np.sqrt(np.clip(out, 0.02, 1.0))
+        noise = rng.standard_normal(out.shape, dtype=np.float32)
+        out = out + np.float32(spread) * shot * noise
+    out = np.clip(out, 0.0, 1.0)
+    if rng.random() < 0.6:
+        bytes_ = (out[..., ::-1] * 255 + 0.5).astype(np.uint8)
+        quality = int(rng.integers(45, 97))
+        coded = cv2.imencode(".jpg", bytes_, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
+        out = decoded[..., ::-1].astype(np.float32) / 255
+    return np.ascontiguousarray(out, dtype=np.float32)
