@@ -138,11 +138,8 @@ def _slopes(
         left, right = max(int(column - half), 0), min(int(column + half) + 2, shape[1])
         if bottom - top < 2 or right - left < 2:
             continue
-        y, x = np.meshgrid(
-            (np.arange(top, bottom) + 0.5 - shape[0] / 2) / scale,
-            (np.arange(left, right) + 0.5 - shape[1] / 2) / scale,
-            indexing="ij",
-        )
+        y = ((np.arange(top, bottom) + 0.5 - shape[0] / 2) / scale)[:, None]
+        x = ((np.arange(left, right) + 0.5 - shape[1] / 2) / scale)[None, :]
         level = extended_height(drop, x, y)
         inside = level > 0
         if not inside.any():
@@ -180,7 +177,7 @@ def scatter(
     size_exponent: float = 1.5,
     contact_angle_range: tuple[float, float] = (np.radians(30), np.radians(80)),
     margin: float = 0.0,
-    max_drops: int = 250,
+    max_drops: int = 160,
 ) -> list[Drop]:
     """Random drops with pixels for metres (pane at a distance of one focal length).
 
@@ -194,9 +191,9 @@ def scatter(
     wanted = coverage * 4 * half[0] * half[1]
     angle = rng.uniform(*contact_angle_range)  # of one pane: drops on it resemble each other
     drops: list[Drop] = []
-    places = np.empty((0, 3))
+    places = np.empty((max_drops, 3))
     area = 0.0
-    for _ in range(8 * max_drops):
+    for _ in range(5 * max_drops):
         if area >= wanted or len(drops) >= max_drops:
             break
         draw = rng.random()
@@ -207,10 +204,11 @@ def scatter(
         if area > 0 and np.pi * radius**2 > 2.0 * (wanted - area):
             continue
         center = rng.uniform(-half - 0.6 * radius, half + 0.6 * radius)
-        apart = np.hypot(places[:, 0] - center[0], places[:, 1] - center[1])
-        if np.any(apart < 0.95 * (places[:, 2] + radius)):
+        others = places[: len(drops)]
+        apart = (others[:, 0] - center[0]) ** 2 + (others[:, 1] - center[1]) ** 2
+        if (apart < (0.95 * (others[:, 2] + radius)) ** 2).any():
             continue
-        places = np.concatenate([places, [[center[0], center[1], radius]]])
+        places[len(drops)] = center[0], center[1], radius
         chosen = stock[int(rng.integers(len(stock)))]
         # Half as many shapes with tails among the small ones, which seldom run.
         if radius < 0.25 * high and chosen.tail_length > 0:

@@ -121,5 +121,5 @@ def through_camera(rng: np.random.Generator, image: Image) -> Image:
         quality = int(rng.integers(45, 97))
         coded = cv2.imencode(".jpg", bytes_, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
-        out = decoded[..., ::-1].astype(np.float32) / 255
+        out = decoded[..., ::-1].astype(np.float32) / np.float32(255)
     return np.ascontiguousarray(out, dtype=np.float32)

@@ -60,6 +60,7 @@ class _Rim:
     core: Array  # centre to rim, tail left out
     support: Array  # centre to the tangent line of the core's rim
     body: float  # radius of the body, metres
+    extent: float  # the largest reach
 
 
 def _circle_exit(phi: Array, dx: float, dy: float, r: float) -> Array:
@@ -104,7 +105,7 @@ def _rim(drop: Drop) -> _Rim:
         raise ValueError(f"contact angle {drop.contact_angle} rad is not within (0, pi/2)")
     unit = _unit_rim(replace(drop, center=(0.0, 0.0), radius=1.0, contact_angle=1.0, sag=0.0))
     r = drop.radius
-    return _Rim(unit.reach * r, unit.core * r, unit.support * r, unit.body * r)
+    return _Rim(unit.reach * r, unit.core * r, unit.support * r, unit.body * r, unit.extent * r)
 
 
 @lru_cache(maxsize=4096)
@@ -129,7 +130,7 @@ def _unit_rim(drop: Drop) -> _Rim:
     slope = (np.roll(core, -1) - np.roll(core, 1)) / (4 * np.pi / TABLE)
     support = core**2 / np.sqrt(core**2 + slope**2)
     full, core, support = (np.append(table, table[0]) * body for table in (full, core, support))
-    return _Rim(full, core, support, float(body))
+    return _Rim(full, core, support, float(body), float(full.max()))
 
 
 def _lookup(table: Array, phi: Array) -> Array:
@@ -141,7 +142,7 @@ def _lookup(table: Array, phi: Array) -> Array:
 
 def reach(drop: Drop) -> float:
     """Largest distance from the drop's centre to its outline, metres."""
-    return float(_rim(drop).reach.max())
+    return _rim(drop).extent
 
 
 def outline(drop: Drop, n: int = 64) -> Array:
@@ -159,8 +160,8 @@ def outline(drop: Drop, n: int = 64) -> Array:
     return np.asarray(drop.center) + chosen_reach[:, None] * around
 
 
-def height(drop: Drop, x: Array, y: Array) -> Array:
-    """Thickness of the water at pane points (x, y), metres, same shape as x; 0 outside.
+def height(drop: Drop, x: NDArray, y: NDArray) -> Array:
+    """Thickness of the water at pane points (x, y), metres; 0 outside. x and y are broadcast.
 
     The profile is that of a spherical cap, stretched to the outline: circles near the centre, the
     outline at the rim. Its slope at the rim is tan(contact_angle) times 1 + sag * sin(direction),
@@ -169,7 +170,7 @@ def height(drop: Drop, x: Array, y: Array) -> Array:
     return np.maximum(extended_height(drop, x, y), 0.0)
 
 
-def extended_height(drop: Drop, x: Array, y: Array) -> Array:
+def extended_height(drop: Drop, x: NDArray, y: NDArray) -> Array:
     """As `height`, but falling below 0 just outside the rim, so that its slope can be measured."""
     rim = _rim(drop)
     dx = np.asarray(x, dtype=np.float64) - drop.center[0]
