@@ -73,7 +73,7 @@ class _Gather(torch.autograd.Function):
     """Weighted sums of table rows; the backward pass adds, or leaves the adding to the sink."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         table: Tensor,
         rows: Tensor,
@@ -86,7 +86,7 @@ class _Gather(torch.autograd.Function):
         return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Any:
         rows, weights = ctx.saved_tensors
         if ctx.sink is None:
             return add_rows(rows, weights, gradient, ctx.size), None, None, None, None
@@ -124,7 +124,7 @@ def level_resolutions(
 
 
 class HashGrid(nn.Module):
-    """A multiresolution grid of features: ``(3, N)`` points in [0, 1] to ``(N, levels * features)``.
+    """Features ``(N, levels * features)`` of points ``(3, N)`` in [0, 1], at several resolutions.
 
     ``size_log2`` bounds the rows of a level's table. Deterministic for a given generator.
     """
@@ -144,9 +144,7 @@ class HashGrid(nn.Module):
             for size in self.sizes
         )
 
-    def forward(
-        self, x: Tensor, prefix: str = "", sink: list[RowGradient] | None = None
-    ) -> Tensor:
+    def forward(self, x: Tensor, prefix: str = "", sink: list[RowGradient] | None = None) -> Tensor:
         parts = []
         for level, table in enumerate(self.tables):
             rows, weights = cell_corners(x, self.resolutions[level], self.sizes[level])

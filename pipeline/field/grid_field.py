@@ -64,7 +64,7 @@ class GridField(nn.Module):
     def render(self, rays: Rays) -> Rendering:
         """See :class:`pipeline.field.base.Field`."""
         with torch.no_grad():
-            proposed, _ = self._propose(rays, None, None)
+            proposed = self._propose(rays, None, None)
             return self._shade(rays, proposed, None, None)
 
     def loss(
@@ -79,7 +79,7 @@ class GridField(nn.Module):
         """See :class:`pipeline.field.base.Field`."""
         learn_proposal = step < 200 or step % 4 == 0
         with torch.set_grad_enabled(learn_proposal):
-            proposed, table_rows = self._propose(rays, generator, sink)
+            proposed = self._propose(rays, generator, sink)
         out = self._shade(rays, proposed.detach(), generator, sink)
         photometric = masked_photometric_loss(out.rgb, observed, drop_mask)
         total = photometric
@@ -107,14 +107,14 @@ class GridField(nn.Module):
 
     def _propose(
         self, rays: Rays, generator: torch.Generator | None, sink: list[RowGradient] | None
-    ) -> tuple[Tensor, None]:
+    ) -> Tensor:
         """The proposal's weights ``(R, B)`` in equal bins of normalised depth."""
         bins, sizes = self.config.bins, self.config.proposal
         count = rays.near.shape[0]
         edges = torch.linspace(0, 1, bins + 1, device=rays.near.device)
         walk = self._walk(rays, edges.expand(count, -1))
         step = walk[:, :, 1:] - walk[:, :, :-1]
-        delta = torch.linalg.vector_norm(step, dim=0)
+        delta = _length(step)
         if generator is None:
             x = walk[:, :, :-1] + 0.5 * step
         else:
@@ -127,16 +127,16 @@ class GridField(nn.Module):
             place = x[axis] * sizes[axis]
             if generator is not None:
                 # Half a cell of noise: on average the nearest cell is the trilinear mixture.
-                place = place + torch.rand(
-                    place.shape, generator=generator, device=place.device
-                ) - 0.5
+                place = (
+                    place + torch.rand(place.shape, generator=generator, device=place.device) - 0.5
+                )
             cell = place.to(torch.int32).clamp_(0, sizes[axis] - 1)
             row += cell * stride
             stride *= sizes[axis]
         ones = torch.ones_like(x[0])[:, None]
         raw = gather(self.proposal, row[:, None], ones, "proposal", sink)
         sigma = torch.exp(raw.view(count, bins).clamp_max(MAX_LOG_DENSITY))
-        return render_weights(sigma, delta, opaque_last=True), None
+        return render_weights(sigma, delta, opaque_last=True)
 
     def _shade(
         self,
@@ -150,7 +150,7 @@ class GridField(nn.Module):
         u = stratified(count, samples, generator, rays.near)
         edges = intervals_around(invert_histogram(proposed + 0.01 / self.config.bins, u))
         walk = self._walk(rays, edges)
-        delta = torch.linalg.vector_norm(walk[:, :, 1:] - walk[:, :, :-1], dim=0)
+        delta = _length(walk[:, :, 1:] - walk[:, :, :-1])
         x = 0.5 * (walk[:, :, 1:] + walk[:, :, :-1])
         features = self.grid(x.reshape(3, -1), "grid.", sink)
         shape = self.shape_out(torch.relu(self.shape_in(features))).view(count, samples, -1)
@@ -170,6 +170,11 @@ class GridField(nn.Module):
         """Unit-cube positions ``(3, R, K)`` of normalised depths ``(R, K)`` along the rays."""
         t = depth_at(edges, rays.near[:, None], rays.far[:, None])
         return self.space.warp(rays.rays_o[:, :, None] + rays.rays_d[:, :, None] * t)
+
+
+def _length(steps: Tensor) -> Tensor:
+    # Ten times faster than torch.linalg.vector_norm over the first axis.
+    return (steps[0].square() + steps[1].square() + steps[2].square()).sqrt()
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:

@@ -32,9 +32,7 @@ def invert_histogram(weights: Tensor, u: Tensor) -> Tensor:
     return (index + inside) / bins
 
 
-def stratified(
-    rays: int, count: int, generator: torch.Generator | None, like: Tensor
-) -> Tensor:
+def stratified(rays: int, count: int, generator: torch.Generator | None, like: Tensor) -> Tensor:
     """``(rays, count)`` increasing numbers in [0, 1], one per equal stratum.
 
     Random within each stratum with a generator, in its middle without one.
@@ -55,3 +53,19 @@ def intervals_around(s: Tensor) -> Tensor:
     first = (2.0 * s[:, :1] - middle[:, :1]).clamp_min(0.0)
     last = (2.0 * s[:, -1:] - middle[:, -1:]).clamp_max(1.0)
     return torch.cat([first, middle, last], dim=1)
+
+
+def invert_pieces(edges: Tensor, weights: Tensor, u: Tensor) -> Tensor:
+    """Positions whose cumulative weight is ``u``, for bins of any width.
+
+    ``edges`` ``(R, B+1)`` increasing, ``weights`` ``(R, B)``, ``u`` ``(R, K)`` sorted, in [0, 1]:
+    NeRF's hierarchical sampling (doi:10.1145/3503250, section 5.2).
+    """
+    mass = weights + 1e-5
+    cdf = torch.cumsum(mass / mass.sum(-1, keepdim=True), dim=-1)
+    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=-1)
+    upper = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
+    low_mass, high_mass = torch.gather(cdf, 1, upper - 1), torch.gather(cdf, 1, upper)
+    low, high = torch.gather(edges, 1, upper - 1), torch.gather(edges, 1, upper)
+    inside = ((u - low_mass) / (high_mass - low_mass).clamp_min(1e-5)).clamp(0.0, 1.0)
+    return low + inside * (high - low)

@@ -8,7 +8,9 @@ from torch import Tensor
 UNDISTORT_STEPS = 24
 
 
-def undistort(x: Tensor, y: Tensor, k1: Tensor, steps: int = UNDISTORT_STEPS) -> tuple[Tensor, Tensor]:
+def undistort(
+    x: Tensor, y: Tensor, k1: Tensor, steps: int = UNDISTORT_STEPS
+) -> tuple[Tensor, Tensor]:
     """Undistorted normalised image coordinates.
 
     Solves ``x_distorted = x (1 + k1 (x^2 + y^2))`` by fixed-point iteration, which converges for
@@ -57,9 +59,7 @@ def project(
     """
     fx, fy, cx, cy, k1 = intrinsics.unbind(-1)
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
-    cam = [
-        (rotation[..., i, :] * points.t()).sum(-1) + translation[..., i] for i in range(3)
-    ]
+    cam = [(rotation[..., i, :] * points.t()).sum(-1) + translation[..., i] for i in range(3)]
     x, y = cam[0] / cam[2], cam[1] / cam[2]
     gain = 1.0 + k1 * (x * x + y * y)
     return fx * x * gain + cx - 0.5, fy * y * gain + cy - 0.5, cam[2]

@@ -37,7 +37,8 @@ def contract(points: Tensor) -> Tensor:
     ``x -> (2 - 1/|x|) x/|x|`` outside (mip-NeRF 360, doi:10.1109/CVPR52688.2022.00539, eq. 10).
     ``points`` ``(3, ...)``. The direction from the origin is kept.
     """
-    norm = torch.linalg.vector_norm(points, dim=0).clamp_min(1.0)
+    x, y, z = points.unbind(0)
+    norm = (x * x + y * y + z * z).sqrt().clamp_min(1.0)
     return points * ((2.0 - 1.0 / norm) / norm)
 
 
@@ -78,7 +79,7 @@ class Space:
 
 
 def mean_camera(cam_from_world: np.ndarray) -> np.ndarray:
-    """The mean camera ``(4, 4)`` of cameras ``(V, 4, 4)``: mean centre, mean axes made orthogonal."""
+    """The mean camera ``(4, 4)`` of cameras ``(V, 4, 4)``: mean centre and orthogonal mean axes."""
     rotation, translation = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
     centre = -np.einsum("vji,vj->vi", rotation, translation).mean(0)
     u, _, vt = np.linalg.svd(rotation.mean(0))
@@ -88,9 +89,7 @@ def mean_camera(cam_from_world: np.ndarray) -> np.ndarray:
     return out
 
 
-def is_forward_facing(
-    cam_from_world: np.ndarray, corners: np.ndarray, near: np.ndarray
-) -> bool:
+def is_forward_facing(cam_from_world: np.ndarray, corners: np.ndarray, near: np.ndarray) -> bool:
     """Whether normalised device coordinates can hold the scene of these cameras.
 
     ``corners`` ``(V, 4, 3)`` are the world directions of each image's corner rays (length 1 along

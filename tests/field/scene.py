@@ -19,7 +19,9 @@ def camera(index: int, count: int) -> np.ndarray:
     """(4, 4) cam_from_world of one of ``count`` views on a small forward-facing arc."""
     angle = 2 * np.pi * index * 0.381966
     radius = 0.75 * np.sqrt((index + 0.5) / count)
-    centre = np.array([radius * np.cos(angle), 0.5 * radius * np.sin(angle), 0.25 * np.sin(3 * angle)])
+    centre = np.array(
+        [radius * np.cos(angle), 0.5 * radius * np.sin(angle), 0.25 * np.sin(3 * angle)]
+    )
     forward = np.array([0.0, 0.3, 6.5]) - centre
     forward /= np.linalg.norm(forward)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -43,7 +45,7 @@ def texture(points: np.ndarray, seed: int) -> np.ndarray:
 
 
 def look(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours ``(N, 3)`` and ray parameters ``(N,)`` of the first surfaces hit (boxes; a grey sky)."""
+    """Colours ``(N, 3)`` and ray parameters ``(N,)`` of the first surfaces hit, or a grey sky."""
     best = np.full(len(directions), np.inf)
     which = np.full(len(directions), -1)
     inverse = 1.0 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)

@@ -1,0 +1,83 @@
+"""A field and the few numbers that it takes to build it again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+
+from pipeline.errors import UserError
+from pipeline.field.grid_field import GridConfig, GridField
+from pipeline.field.paper_field import PaperConfig, PaperField
+from pipeline.geometry.spaces import Space, fit_space
+
+
+def scene_space(
+    kind: str, cams: np.ndarray, intrinsics: np.ndarray, sizes: np.ndarray, near: float, far: float
+) -> Space:
+    """The :class:`Space` around what cameras see between the depths ``near`` and ``far``.
+
+    ``cams`` ``(V, 4, 4)`` cam_from_world, ``intrinsics`` ``(V, 5)`` fx, fy, cx, cy, k1, ``sizes``
+    ``(V, 2)`` width and height; ``kind`` is ndc, contract or auto.
+    """
+    corners = np.empty((len(cams), 4, 3))
+    for i, (right, bottom) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
+        x = (sizes[:, 0] * right - intrinsics[:, 2]) / intrinsics[:, 0]
+        y = (sizes[:, 1] * bottom - intrinsics[:, 3]) / intrinsics[:, 1]
+        r2 = x * x + y * y
+        # One Newton-like step is enough for bounds: distortion moves a corner by a few per cent.
+        gain = 1.0 + intrinsics[:, 4] * r2
+        cam = np.stack([x / gain, y / gain, np.ones_like(x)], -1)
+        corners[:, i] = np.einsum("vji,vj->vi", cams[:, :3, :3], cam)
+    count = len(cams)
+    return fit_space(kind, cams, corners, np.full(count, near), np.full(count, far))
+
+
+def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:
+    """``coarse``, ``fine`` and ``proposal`` vertices per axis: ``fine`` along the longer side."""
+    if space.kind == "contract":
+        return {"coarse": (24,) * 3, "fine": (fine,) * 3, "proposal": (96,) * 3}
+    width, height = (space.high[i] - space.low[i] for i in range(2))
+    longest = max(width, height)
+
+    def across(count: int, depth: int) -> tuple[int, int, int]:
+        return (
+            max(2, round(count * width / longest)),
+            max(2, round(count * height / longest)),
+            depth,
+        )
+
+    return {"coarse": across(24, 16), "fine": across(fine, fine // 4), "proposal": across(96, 64)}
+
+
+def build(model: str, config: Mapping[str, Any], space: Space, seed: int) -> GridField | PaperField:
+    """A fresh field: ``fast`` or ``paper``. ``config`` overrides fields of its config class."""
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
+    if model == "paper":
+        return PaperField(PaperConfig(**values), space, seed)
+    return GridField(GridConfig(**values), space, seed)
+
+
+def describe(field: GridField | PaperField) -> dict[str, Any]:
+    """What :func:`restore` needs beside the tensors: model, config and space, as plain numbers."""
+    name = "paper" if isinstance(field, PaperField) else "fast"
+    return {"model": name, "config": asdict(field.config), "space": field.space.to_json()}
+
+
+def restore(
+    description: Mapping[str, Any], tensors: Mapping[str, np.ndarray]
+) -> GridField | PaperField:
+    """The field that :func:`describe` described, with its fitted tensors."""
+    try:
+        space = Space.from_json(description["space"])
+        field = build(description["model"], description["config"], space, 0)
+        field.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in tensors.items()})
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"The fitted field cannot be read back: {error}.",
+            hint="Run `python -m stages.nerf` again.",
+        ) from None
+    return field

@@ -1,0 +1,58 @@
+"""Which pixels of a view show a surface that no photo saw uncovered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+TOLERANCE = 0.05
+
+
+class Witness(NamedTuple):
+    """A photo that was fitted: pose ``(4, 4)``, fx, fy, cx, cy, k1, keep mask, rendered depth."""
+
+    cam_from_world: np.ndarray
+    intrinsics: tuple[float, float, float, float, float]
+    keep_mask: np.ndarray
+    depth: np.ndarray
+
+
+def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) -> np.ndarray:
+    """How many photos saw each pixel's surface uncovered, at every ``stride``-th pixel, uint8.
+
+    The surface is where the field's own depth puts it; a photo saw it when the point falls on a
+    kept pixel whose depth agrees within 5 per cent.
+    """
+    fx, fy, cx, cy, k1 = view.intrinsics
+    height, width = view.depth.shape
+    rows, columns = np.mgrid[0:height:stride, 0:width:stride]
+    depth = view.depth[::stride, ::stride].astype(np.float64).ravel()
+    xd, yd = (columns.ravel() + 0.5 - cx) / fx, (rows.ravel() + 0.5 - cy) / fy
+    x, y = xd, yd
+    for _ in range(8 if k1 else 0):
+        gain = 1.0 + k1 * (x * x + y * y)
+        x, y = xd / gain, yd / gain
+    world_from_cam = np.linalg.inv(view.cam_from_world)
+    cam = np.stack([x * depth, y * depth, depth])
+    points = world_from_cam[:3, :3] @ cam + world_from_cam[:3, 3:]
+    count = np.zeros(depth.size, np.uint8)
+    for other in witnesses:
+        count += _sees(other, points)
+    return count.reshape(rows.shape)
+
+
+def _sees(other: Witness, points: np.ndarray) -> np.ndarray:
+    fx, fy, cx, cy, k1 = other.intrinsics
+    x, y, z = other.cam_from_world[:3, :3] @ points + other.cam_from_world[:3, 3:]
+    safe = np.maximum(z, 1e-9)
+    x, y = x / safe, y / safe
+    gain = 1.0 + k1 * (x * x + y * y)
+    height, width = other.keep_mask.shape
+    column = np.clip(np.floor(fx * x * gain + cx), -1, width).astype(np.int64)
+    row = np.clip(np.floor(fy * y * gain + cy), -1, height).astype(np.int64)
+    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    agrees = np.abs(other.depth[row, column] - z) < TOLERANCE * z
+    return inside & other.keep_mask[row, column] & agrees
