@@ -39,21 +39,25 @@ def _wet(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.floa
     kind = rng.random()
     if kind < 0.35:
         blur = float(rng.uniform(0.0, 1.5))  # the pane is (nearly) in focus
-    elif kind < 0.7:
+    elif kind < 0.6:
         blur = float(rng.uniform(0.1, 0.8) * largest)
     else:
-        blur = float(rng.uniform(0.6, 1.8) * largest)  # a window close to the lens
+        blur = float(rng.uniform(0.7, 2.2) * largest)  # a window close to the lens
     blur = min(blur, 44.0)
     # Drops much smaller than the disc of confusion leave nothing visible.
-    smallest = max(smallest, 0.3 * blur)
+    smallest = max(smallest, 0.25 * blur)
     largest = max(largest, 1.3 * smallest)
-    focal = float(side * np.exp(rng.uniform(np.log(0.7), np.log(4.0))))
+    # Drops are small against their distance, else they would magnify rather than invert.
+    focal = max(float(side * np.exp(rng.uniform(np.log(0.7), np.log(4.0)))), 6.0 * largest)
+    # Clean wet glass holds flatter drops than the usual 30 to 80 degrees.
+    angles = np.radians((12, 40) if rng.random() < 0.35 else (30, 80))
     drops = scatter(
         rng,
         (height, width),
         float(np.exp(rng.uniform(np.log(0.03), np.log(0.40)))),
         (smallest, largest),
         size_exponent=float(rng.uniform(0.5, 3.0)),
+        contact_angle_range=(float(angles[0]), float(angles[1])),
         margin=0.5 * blur,
     )
     return paint(
