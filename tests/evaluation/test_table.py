@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.evaluation.table import gains, label_of, main, table
+from pipeline.io.atomic import write_json
+
+MASKED = {
+    "test": {"psnr": 28.456, "ssim": 0.91, "lpips": None, "lpips_reason": "no weights"},
+    "masks": {"iou": 0.85},
+    "poses": {"registered": 24, "total": 24},
+}
+UNMASKED = {"test": {"psnr": 22.0, "ssim": 0.8}, "poses": {"registered": 24, "total": 24}}
+
+
+def test_rows_align_and_gaps_are_explained():
+    lines = table({"demo": MASKED, "demo unmasked": UNMASKED}).splitlines()
+    assert len({len(line) for line in lines[:4]}) == 1
+    assert lines[2].startswith("| demo          |     28.46 | 0.910 |     - |")
+    assert lines[4] == "- test.lpips: no weights"
+
+
+def test_the_gain_is_told_when_both_are_known():
+    assert (
+        gains({"demo": MASKED, "raw": UNMASKED}) == "demo over raw: +6.46 dB on held-out views.\n"
+    )
+    assert gains({"demo": MASKED, "raw": {"test": {"psnr": None}}}) == ""
+
+
+def test_labels_come_from_places():
+    assert label_of(Path("artifacts/demo/metrics.json")) == "demo"
+    assert label_of(Path("/x/artifacts/demo/unmasked/metrics.json")) == "demo unmasked"
+
+
+def test_the_command(tmp_path, capsys):
+    path = tmp_path / "artifacts" / "demo" / "metrics.json"
+    write_json(path, MASKED)
+    assert main([str(path)]) == 0
+    assert "28.46" in capsys.readouterr().out
+    assert main([str(path.with_name("none.json"))]) == 2
+    assert "none.json does not exist" in capsys.readouterr().err
+    assert main([]) == 2
