@@ -1,0 +1,1 @@
+"""Cameras, poses, rays, the spaces that fields live in, and camera paths: arrays only, no files."""
