@@ -34,6 +34,7 @@ def mitsuba() -> Any:
     try:
         if mi.variant() != VARIANT:
             mi.set_variant(VARIANT)
+            mi.set_log_level(mi.LogLevel.Error)
         import drjit as dr
 
         dr.eval(mi.Float([0.0, 1.0]) + 1)
@@ -77,17 +78,14 @@ def sky_emitter(place: Place) -> Any:
 
 
 def hit_radiance(scene: Any, ray: Any, si: Any, active: Any) -> Any:
-    """Radiance towards the ray's origin: texture times baked light, or the sky's where it misses.
+    """Radiance towards the ray's origin: texture times baked light; the sky's where it misses."""
+    import drjit as dr
 
-    A surface is dark from behind: the light belongs to its outside.
-    """
     mi = mitsuba()
     valid = active & si.is_valid()
     bsdf = si.bsdf(ray)
     surface = bsdf.eval_diffuse_reflectance(si, valid) * si.shape.eval_attribute_3(LIGHT, si, valid)
     sky = scene.environment().eval(si, active & ~si.is_valid())
-    import drjit as dr
-
     return dr.select(valid, mi.Color3f(surface), mi.Color3f(sky))
 
 
@@ -102,23 +100,14 @@ def _hammersley(n: int) -> npt.NDArray[np.float64]:
     return np.stack([(index + 0.5) / n, bits], 1)
 
 
-def _cosine_rays(normals: Array, count: int, rng: np.random.Generator) -> Array:
-    """Directions (N * count, 3), cosine-distributed about each normal, shifted at random each."""
-    base = _hammersley(count)
-    shifts = rng.random((len(normals), 1, 2))
-    u = (base[None] + shifts) % 1.0
-    r, phi = np.sqrt(u[..., 0]), 2 * np.pi * u[..., 1]
-    local = np.stack([r * np.cos(phi), r * np.sin(phi), np.sqrt(1 - u[..., 0])], -1)
-    helper = np.where(np.abs(normals[:, 1:2]) > 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    e1 = np.cross(helper, normals)
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    basis = np.stack([e1, np.cross(normals, e1), normals], 1)
-    return np.einsum("nck,nkj->ncj", local, basis).reshape(-1, 3).astype(np.float32)
-
-
-def _visible(scene: Any, origin: Array, direction: Array, far: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+def _visible(
+    scene: Any, origin: Array, direction: Array, far: npt.NDArray[np.floating]
+) -> npt.NDArray[np.bool_]:
     mi = mitsuba()
-    o, d = mi.Point3f(np.ascontiguousarray(origin.T)), mi.Vector3f(np.ascontiguousarray(direction.T))
+    o, d = (
+        mi.Point3f(np.ascontiguousarray(origin.T)),
+        mi.Vector3f(np.ascontiguousarray(direction.T)),
+    )
     ray = mi.Ray3f(o, d, mi.Float(np.ascontiguousarray(far, np.float32)), 0.0, [])
     return ~np.asarray(scene.ray_test(ray)).astype(bool)
 
@@ -134,33 +123,43 @@ def direct_light(scene: Any, place: Place, points: Array, normals: Array) -> Arr
         distance = np.linalg.norm(way, axis=1)
         unit = (way / distance[:, None]).astype(np.float32)
         seen = _visible(scene, points, unit, distance * 0.98)
-        falloff = np.maximum((normals * unit).sum(1), 0) * seen / np.maximum(distance / SCALE, 0.1) ** 2
+        falloff = (
+            np.maximum((normals * unit).sum(1), 0) * seen / np.maximum(distance / SCALE, 0.1) ** 2
+        )
         out = out + falloff[:, None] * np.asarray(lamp.intensity, np.float32)
     return out.astype(np.float32)
 
 
-def _gathered(scene: Any, points: Array, normals: Array, count: int, rng: np.random.Generator) -> Array:
-    """Mean radiance (N, 3) that `count` cosine-distributed rays from each point meet."""
+def _gathered(
+    scene: Any, points: Array, normals: Array, count: int, rng: np.random.Generator
+) -> Array:
+    """Mean radiance (N, 3) that `count` cosine-distributed rays from each point meet.
+
+    Every point has the same low-discrepancy set, shifted at random on the torus.
+    """
     import drjit as dr
 
     mi = mitsuba()
-    out, chunk = [], max(1, 2_000_000 // count)
+    base = mi.Point2f(np.ascontiguousarray(_hammersley(count).T.astype(np.float32)))
+    out, chunk = [], max(1, 4_000_000 // count)
     for start in range(0, len(points), chunk):
         part = slice(start, start + chunk)
-        d = _cosine_rays(normals[part], count, rng)
-        o = np.repeat(points[part], count, axis=0)
-        ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
-        si = scene.ray_intersect(ray)
-        light = hit_radiance(scene, ray, si, mi.Bool(True))
-        # The outside of a piece is not known to Mitsuba; a point inside a solid sees its near
-        # walls, which the sky's absence darkens enough.
-        sums = [np.asarray(c).reshape(-1, count).mean(1) for c in (light.x, light.y, light.z)]
-        out.append(np.stack(sums, 1))
-    dr.flush_malloc_cache()
+        n = len(points[part])
+        which = dr.arange(mi.UInt32, n * count)
+        vertex, number = which // count, which % count
+        columns = (points[part], normals[part], rng.random((n, 2), np.float32))
+        place, normal, shift = (np.ascontiguousarray(c.T) for c in columns)
+        u = dr.gather(mi.Point2f, base, number) + dr.gather(mi.Point2f, mi.Point2f(shift), vertex)
+        local = mi.warp.square_to_cosine_hemisphere(u - dr.floor(u))
+        frame = mi.Frame3f(dr.gather(mi.Normal3f, mi.Normal3f(normal), vertex))
+        ray = mi.Ray3f(dr.gather(mi.Point3f, mi.Point3f(place), vertex), frame.to_world(local))
+        light = hit_radiance(scene, ray, scene.ray_intersect(ray), mi.Bool(True))
+        sums = [dr.block_sum(c, count) / count for c in (light.x, light.y, light.z)]
+        out.append(np.stack([np.asarray(c) for c in sums], 1))
     return np.concatenate(out).astype(np.float32)
 
 
-def bake(place: Place, *, rays: int = 192, bounces: int = 2) -> list[Array]:
+def bake(place: Place, *, rays: int = 128, bounces: int = 2) -> list[Array]:
     """Light per vertex of each mesh, (N, 3) float32 radiance factors, tint and glow included.
 
     rays: directions per vertex and pass; bounces: of light between surfaces after the first.
@@ -176,7 +175,9 @@ def bake(place: Place, *, rays: int = 192, bounces: int = 2) -> list[Array]:
     sky = sky_emitter(place)
     sun = None
     for _ in range(bounces + 1):
-        items = {str(k): shape(m, v) for k, (m, v) in enumerate(zip(place.meshes, lights, strict=True))}
+        items = {
+            str(k): shape(m, v) for k, (m, v) in enumerate(zip(place.meshes, lights, strict=True))
+        }
         scene = mi.load_dict({"type": "scene", "sky": sky, **items})
         if sun is None:
             sun = direct_light(scene, place, points, normals)

@@ -100,7 +100,7 @@ def _integrator() -> Any:
     return mi.load_dict({"type": "baked_light"})
 
 
-def bake_place(place: Place, *, rays: int = 192, bounces: int = 2) -> Baked:
+def bake_place(place: Place, *, rays: int = 128, bounces: int = 2) -> Baked:
     """The place with its light; see bake.bake."""
     return Baked(place, bake(place, rays=rays, bounces=bounces))
 
@@ -192,7 +192,9 @@ def render(
         items["water"] = _water(drops, around_camera)
     scene = mi.load_dict({"type": "scene", "sky": sky_emitter(baked.place), **items})
     sensor = mi.load_dict(_sensor(camera, world_from_cam.astype(np.float32), spp))
-    image = np.asarray(mi.render(scene, sensor=sensor, integrator=_integrator(), spp=spp, seed=seed))
+    image = np.asarray(
+        mi.render(scene, sensor=sensor, integrator=_integrator(), spp=spp, seed=seed)
+    )
     distance, hit = image[..., 4], image[..., 5]
     depth = np.where(hit > 0.5, distance / np.maximum(hit, 1e-6), 0) / SCALE * _cosines(camera)
     return Picture(
@@ -203,7 +205,7 @@ def render(
 
 
 def exposure(radiance: Array, *, grey: float = 0.17, white: float = 0.97) -> float:
-    """Factor that brings the median of a picture's luminance to `grey`, sparing its 97th percentile."""
+    """Factor that brings a picture's median luminance to `grey`, sparing its whites."""
     luminance = radiance @ np.array([0.2126, 0.7152, 0.0722], np.float32)
     middle, high = np.percentile(luminance, [50, 97])
     return float(min(grey / max(middle, 1e-6), 1.6 * white / max(high, 1e-6)))

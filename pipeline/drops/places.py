@@ -75,7 +75,11 @@ def _street(rng: Rng) -> tuple[Builder, dict[str, object]]:
     azimuth, elevation = rng.uniform(-2.4, 2.4), rng.uniform(0.6, 1.0)
     # Behind the camera's plane more often than not, so that the fronts are lit.
     azimuth = np.pi - 0.45 * azimuth
-    sun = [np.cos(elevation) * np.sin(azimuth), -np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    sun = [
+        np.cos(elevation) * np.sin(azimuth),
+        -np.sin(elevation),
+        np.cos(elevation) * np.cos(azimuth),
+    ]
     warm = np.array([1.0, 0.93, 0.82]) * rng.uniform(2.2, 3.2)
     sky = clear_sky(rng, np.array([0.20, 0.42, 0.85]) * 0.7, np.array([0.62, 0.78, 0.95]) * 0.75,
                     np.array([0.85, 0.85, 0.86]), cover=rng.uniform(0.35, 0.6))  # fmt: skip
@@ -85,9 +89,9 @@ def _street(rng: Rng) -> tuple[Builder, dict[str, object]]:
 def _room(rng: Rng) -> tuple[Builder, dict[str, object]]:
     b, lamps = places_room.build(rng)
     sun = [rng.uniform(-0.6, 0.6), -0.75, 0.75]
-    sky = clear_sky(rng, np.array([0.5, 0.7, 1.0]) * 5, np.array([0.9, 0.95, 1.0]) * 6,
-                    np.array([1, 1, 1.0]) * 8, cover=0.5)  # fmt: skip
-    return b, {"sky": sky, "sun": sun, "irradiance": np.array([1, 0.93, 0.8]) * 9,
+    sky = clear_sky(rng, np.array([0.5, 0.7, 1.0]) * 1.6, np.array([0.9, 0.95, 1.0]) * 1.9,
+                    np.array([1, 1, 1.0]) * 2.2, cover=0.5)  # fmt: skip
+    return b, {"sky": sky, "sun": sun, "irradiance": np.array([1, 0.93, 0.8]) * 5,
                "lamps": [Lamp(*lamp) for lamp in lamps]}  # fmt: skip
 
 

@@ -47,11 +47,16 @@ class Cell:
     def apply(self, uv: Array) -> Array:
         """Texture coordinates in [0, 1] moved into the cell, a hair inside its border."""
         inside = 0.01 + 0.98 * np.clip(uv, 0, 1)
-        at = (inside + [self.column, self.row]) / [self.columns, self.rows]
+        at = (inside + np.array([self.column, self.row])) / [self.columns, self.rows]
         return at.astype(np.float32)
 
 
 FIT = Cell(0, 0, 1, 1)
+
+
+def offset(x: float, y: float, z: float) -> npt.NDArray[np.float64]:
+    """The vector (3,)."""
+    return np.array([x, y, z], np.float64)
 
 
 def turn(yaw: float) -> Array:
@@ -98,7 +103,7 @@ class Builder:
         cell: Cell | None = None, tint: Vec = WHITE, glow: float = 0.0, step: float | None = None,
         shift: tuple[float, float] = (0.0, 0.0),
     ) -> None:  # fmt: skip
-        """Flat parallelogram seen from outside; one texture per `tile` metres, or a `cell` of it."""
+        """Parallelogram seen from outside; one texture per `tile` metres, or a `cell` of it."""
         o, a, b = (np.asarray(v, np.float32) for v in (top_left, right, down))
         la, lb = float(np.linalg.norm(a)), float(np.linalg.norm(b))
         step = step or self.step
@@ -172,8 +177,11 @@ class Builder:
     def ball(self, material: str, centre: Vec, radii: Vec, *, sides: int = 10, tint: Vec = WHITE,
              tile: tuple[float, float] = (2.0, 1.0), glow: float = 0.0) -> None:  # fmt: skip
         """Ellipsoid with half axes `radii` (3,)."""
-        theta, phi = np.meshgrid(np.linspace(0, np.pi, sides // 2 + 2), np.linspace(0, 2 * np.pi, sides + 1),
-                                 indexing="ij")  # fmt: skip
+        theta, phi = np.meshgrid(
+            np.linspace(0, np.pi, sides // 2 + 2),
+            np.linspace(0, 2 * np.pi, sides + 1),
+            indexing="ij",
+        )
         n = np.stack([np.sin(theta) * np.cos(phi), -np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
         uv = np.stack([phi / (2 * np.pi) * tile[0], theta / np.pi * tile[1]], -1)
         r = np.asarray(radii, np.float32)
@@ -189,7 +197,7 @@ class Builder:
         c, out = np.asarray(centres, np.float32), _unit(np.asarray(outward, np.float32))
         n = len(c)
         axis = _unit(rng.standard_normal((n, 3)) + 0.6 * out + [0, 0.4, 0])
-        side = _unit(np.cross(axis, _unit(rng.standard_normal((n, 3)) + [0, 0, 0.8])))
+        side = _unit(np.cross(axis, _unit(rng.standard_normal((n, 3)) + offset(0, 0, 0.8))))
         long = size * rng.uniform(0.6, 1.3, (n, 1))
         corners = [-axis * long, side * long * slender, axis * long, -side * long * slender]
         v = np.stack([c + 0.5 * k for k in corners], 1)

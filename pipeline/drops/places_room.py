@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.drops import places_textures as tx
-from pipeline.drops.places_parts import Array, Builder, Cell, turn
-from pipeline.drops.places_street import at, cell, planter, tree
+from pipeline.drops.places_parts import Array, Builder, Cell, offset, turn
+from pipeline.drops.places_things import at, cell, planter, tree
 
 Rng = np.random.Generator
 LampPair = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -42,12 +42,33 @@ def shelf(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
     deep = 0.32
     tint = rng.uniform(0.6, 1.2) * np.ones(3)
     middle = left + right * width / 2
-    b.panel("wood", left + up * height + out * 0.02, right * width, -up * height, tile=0.9, tint=tint * 0.8)
+    b.panel(
+        "wood",
+        left + up * height + out * 0.02,
+        right * width,
+        -up * height,
+        tile=0.9,
+        tint=tint * 0.8,
+    )
     for x in (0.0, width):
-        b.box("wood", left + right * x + up * height / 2 + out * deep / 2, (0.04, height, deep), yaw=yaw, tint=tint, tile=0.8)
+        b.box(
+            "wood",
+            left + right * x + up * height / 2 + out * deep / 2,
+            (0.04, height, deep),
+            yaw=yaw,
+            tint=tint,
+            tile=0.8,
+        )
     levels = np.arange(0.1, height - 0.25, 0.36)
     for level in [*levels, height]:
-        b.box("wood", middle + up * level + out * deep / 2, (width, 0.035, deep), yaw=yaw, tint=tint, tile=0.8)
+        b.box(
+            "wood",
+            middle + up * level + out * deep / 2,
+            (width, 0.035, deep),
+            yaw=yaw,
+            tint=tint,
+            tile=0.8,
+        )
     for level in levels:
         x = 0.05
         while x < width - 0.12:
@@ -57,7 +78,12 @@ def shelf(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
                 continue
             w, h = rng.uniform(0.025, 0.07), rng.uniform(0.19, 0.31)
             colour = rng.uniform(0.12, 1.1, 3) * rng.uniform(0.5, 1.1)
-            p = left + right * (x + w / 2) + up * (level + 0.02 + h / 2) + out * rng.uniform(0.16, 0.2)
+            p = (
+                left
+                + right * (x + w / 2)
+                + up * (level + 0.02 + h / 2)
+                + out * rng.uniform(0.16, 0.2)
+            )
             spine = Cell(int(rng.integers(0, 8)), 0, 8, 1)
             b.box("spine", p, (w, h, 0.2), yaw=yaw, cell=spine, tint=colour, step=0.2)
             x += w + 0.004
@@ -69,23 +95,58 @@ def thing(b: Builder, rng: Rng, foot: Array, size: float) -> None:
     kind = rng.integers(0, 4)
     if kind == 0:
         r = np.array([0.16, 0.12, 0.14, 0.3, 0.34, 0.24, 0.2]) * size
-        b.lathe("tile", foot, np.stack([r, np.linspace(1, 0, 7) * size], 1), tint=colour * 1.3, tile=(2, 1))
+        b.lathe(
+            "tile",
+            foot,
+            np.stack([r, np.linspace(1, 0, 7) * size], 1),
+            tint=colour * 1.3,
+            tile=(2, 1),
+        )
     elif kind == 1:
         profile = [(0.06, 1), (0.07, 0.7), (0.18, 0.5), (0.18, 0.02)]
         b.lathe("paint", foot, np.asarray(profile) * size, tint=colour * 0.6)
     elif kind == 2:
-        b.lathe("cloth", foot, np.asarray([(0.5, 0.4), (0.4, 0.2), (0.18, 0.0)]) * size, tint=colour, tile=(3, 1))
+        b.lathe(
+            "cloth",
+            foot,
+            np.asarray([(0.5, 0.4), (0.4, 0.2), (0.18, 0.0)]) * size,
+            tint=colour,
+            tile=(3, 1),
+        )
         for _ in range(5):
-            spot = foot + np.append(rng.uniform(-0.22, 0.22, 2) * size, 0)[[0, 2, 1]] - [0, 0.42 * size, 0]
-            b.ball("paint", spot, np.full(3, 0.16 * size), sides=8, tint=rng.uniform(0.3, 1, 3) * [1, 0.8, 0.3])
+            spot = (
+                foot
+                + np.append(rng.uniform(-0.22, 0.22, 2) * size, 0)[[0, 2, 1]]
+                - [0, 0.42 * size, 0]
+            )
+            b.ball(
+                "paint",
+                spot,
+                np.full(3, 0.16 * size),
+                sides=8,
+                tint=rng.uniform(0.3, 1, 3) * [1, 0.8, 0.3],
+            )
     else:
-        b.box("poster", foot - [0, size * 0.35, 0], np.array([0.7, 0.7, 0.6]) * size, yaw=rng.uniform(-0.6, 0.6), cell=cell(rng), step=0.2)
+        b.box(
+            "poster",
+            foot - offset(0, size * 0.35, 0),
+            np.array([0.7, 0.7, 0.6]) * size,
+            yaw=rng.uniform(-0.6, 0.6),
+            cell=cell(rng),
+            step=0.2,
+        )
 
 
 def pot_plant(b: Builder, rng: Rng, foot: Array, size: float) -> None:
     """A pot with arching stems."""
     up = np.array([0, -1, 0], np.float32)
-    b.lathe("tile", foot, np.asarray([(0.24, 0.4), (0.26, 0.36), (0.17, 0.0)]) * size, tint=rng.uniform(0.5, 1.2, 3), tile=(3, 1))
+    b.lathe(
+        "tile",
+        foot,
+        np.asarray([(0.24, 0.4), (0.26, 0.36), (0.17, 0.0)]) * size,
+        tint=rng.uniform(0.5, 1.2, 3),
+        tile=(3, 1),
+    )
     for _ in range(14):
         angle, lean = rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.55) * size
         s = np.linspace(0, 1, 7)[:, None]
@@ -93,34 +154,60 @@ def pot_plant(b: Builder, rng: Rng, foot: Array, size: float) -> None:
         stem = foot + up * size * (0.38 + 0.85 * s - 0.25 * s**2) + way * lean * s**2
         b.tube("leaf", stem, 0.012 * size + 0.003, sides=4)
         spot = np.repeat(stem[2:], 3, axis=0) + rng.normal(0, 0.06 * size, (15, 3))
-        b.leaves("leaf", spot, spot - foot - up * 0.5 * size, 0.2 * size, rng, tint=(0.8, 1.05, 0.8))
+        b.leaves(
+            "leaf", spot, spot - foot - up * 0.5 * size, 0.2 * size, rng, tint=(0.8, 1.05, 0.8)
+        )
 
 
 def table(b: Builder, rng: Rng, foot: Array, yaw: float, lamps: list[LampPair]) -> None:
     """Table with a lamp and things on it, a chair on each side."""
     r, w, d, h = turn(yaw), rng.uniform(1.3, 1.8), 0.8, 0.75
     tint = rng.uniform(0.6, 1.3) * np.ones(3)
-    b.box("wood", foot + [0, -h, 0], (w, 0.05, d), yaw=yaw, tint=tint, tile=0.7, step=0.12)
+    b.box("wood", foot + offset(0, -h, 0), (w, 0.05, d), yaw=yaw, tint=tint, tile=0.7, step=0.12)
     for x in (-1, 1):
         for z in (-1, 1):
-            b.box("wood", foot + r @ np.array([x * (w / 2 - 0.06), -h / 2, z * (d / 2 - 0.06)]), (0.06, h, 0.06), yaw=yaw, tint=tint)
+            b.box(
+                "wood",
+                foot + r @ np.array([x * (w / 2 - 0.06), -h / 2, z * (d / 2 - 0.06)]),
+                (0.06, h, 0.06),
+                yaw=yaw,
+                tint=tint,
+            )
     for k in range(6):
         spot = foot + r @ np.array([(-0.42 + 0.17 * k) * w, -h - 0.025, rng.uniform(-0.28, 0.25)])
         if k == 3:
-            b.lathe("metal", spot, [(0.015, 0.34), (0.015, 0.03), (0.08, 0.02), (0.08, 0.0)], sides=10)
-            b.lathe("paint", spot, [(0.09, 0.52), (0.19, 0.30)], sides=18, tint=(1.0, 0.85, 0.6), glow=1.6)
-            lamps.append((tuple(float(v) for v in spot - [0, 0.40, 0]), (1.2, 0.9, 0.55)))
+            b.lathe(
+                "metal", spot, [(0.015, 0.34), (0.015, 0.03), (0.08, 0.02), (0.08, 0.0)], sides=10
+            )
+            b.lathe(
+                "paint",
+                spot,
+                [(0.09, 0.52), (0.19, 0.30)],
+                sides=18,
+                tint=(1.0, 0.85, 0.6),
+                glow=0.8,
+            )
+            lamps.append((tuple(float(v) for v in spot - offset(0, 0.40, 0)), (1.2, 0.9, 0.55)))
         else:
             thing(b, rng, spot.astype(np.float32), rng.uniform(0.18, 0.3))
     for side in (-1, 1):
         c = foot + r @ np.array([side * w * 0.28, 0, side * (d / 2 + 0.2)])
-        b.box("wood", c + [0, -0.45, 0], (0.42, 0.04, 0.42), yaw=yaw, tint=tint * 0.9, tile=0.5)
+        b.box(
+            "wood", c + offset(0, -0.45, 0), (0.42, 0.04, 0.42), yaw=yaw, tint=tint * 0.9, tile=0.5
+        )
         for x in (-0.18, 0.18):
             for z in (-0.18, 0.18):
                 tall = 0.9 if z * side > 0 else 0.45
                 b.tube("wood", [c + r @ np.array([x, 0, z]), c + r @ np.array([x, -tall, z])], 0.02)
         for k in range(3):
-            b.box("wood", c + r @ np.array([0, -0.6 - 0.12 * k, side * 0.18]), (0.38, 0.05, 0.025), yaw=yaw, tint=tint * 0.9, tile=0.5)
+            b.box(
+                "wood",
+                c + r @ np.array([0, -0.6 - 0.12 * k, side * 0.18]),
+                (0.38, 0.05, 0.025),
+                yaw=yaw,
+                tint=tint * 0.9,
+                tile=0.5,
+            )
 
 
 def shell(b: Builder, rng: Rng, half: float, back: float, tall: float) -> None:
@@ -135,8 +222,20 @@ def shell(b: Builder, rng: Rng, half: float, back: float, tall: float) -> None:
     low, high = 0.85, tall - 0.35
     middle, wide = rng.uniform(-0.8, 0.8), rng.uniform(2.2, 2.9)
     x0, x1 = middle - wide / 2, middle + wide / 2
-    for left, right, bottom, top in ((-half, x0, 0, tall), (x1, half, 0, tall), (x0, x1, 0, low), (x0, x1, high, tall)):
-        b.panel("brick", at(left, top, back), [right - left, 0, 0], [0, top - bottom, 0], tile=1.6, shift=(left / 1.6, 0))
+    for left, right, bottom, top in (
+        (-half, x0, 0, tall),
+        (x1, half, 0, tall),
+        (x0, x1, 0, low),
+        (x0, x1, high, tall),
+    ):
+        b.panel(
+            "brick",
+            at(left, top, back),
+            [right - left, 0, 0],
+            [0, top - bottom, 0],
+            tile=1.6,
+            shift=(left / 1.6, 0),
+        )
     for x in np.linspace(x0, x1, 4):
         b.box("paint", at(x, (low + high) / 2, back), (0.07, high - low, 0.1), step=0.5)
     for h in np.linspace(low, high, 3):
@@ -147,11 +246,25 @@ def shell(b: Builder, rng: Rng, half: float, back: float, tall: float) -> None:
     colour = rng.uniform(0.3, 1.0, 3)
     for x in (x0 - 0.25, x1 + 0.25):
         s = np.linspace(-0.3, 0.3, 25)
-        v = [[x + k, at(0, h, 0)[1], back - 0.12 + 0.05 * np.sin(k * 60)] for h in np.linspace(high + 0.2, 0.3, 12) for k in s]
+        v = [
+            [x + k, at(0, h, 0)[1], back - 0.12 + 0.05 * np.sin(k * 60)]
+            for h in np.linspace(high + 0.2, 0.3, 12)
+            for k in s
+        ]
         n = [[-np.cos(k * 60) * 0.8, 0, -1.0] for _ in range(12) for k in s]
         uv = [[k, h] for h in np.linspace(0, 1, 12) for k in s]
         index = np.arange(12 * 25).reshape(12, 25)
-        quad = np.stack([index[:-1, :-1], index[1:, 1:], index[:-1, 1:], index[:-1, :-1], index[1:, :-1], index[1:, 1:]], -1)
+        quad = np.stack(
+            [
+                index[:-1, :-1],
+                index[1:, 1:],
+                index[:-1, 1:],
+                index[:-1, :-1],
+                index[1:, :-1],
+                index[1:, 1:],
+            ],
+            -1,
+        )
         b.add("cloth", v, n, uv, quad.reshape(-1, 3), colour)
 
 
@@ -160,9 +273,17 @@ def garden(b: Builder, rng: Rng, back: float) -> None:
     b.panel("grass", at(-9, -0.2, back + 8), [18, 0, 0], [0, 0, -7.9], tile=1.5, step=0.5)
     b.panel("brick", at(-9, 2.0, back + 8), [18, 0, 0], [0, 2.3, 0], tile=1.6, step=0.4)
     for _ in range(3):
-        tree(b, rng, at(rng.uniform(-3.5, 3.5), -0.2, back + rng.uniform(3.5, 7)), rng.uniform(3.4, 4.8), 800)
+        tree(
+            b,
+            rng,
+            at(rng.uniform(-3.5, 3.5), -0.2, back + rng.uniform(3.5, 7)),
+            rng.uniform(3.4, 4.8),
+            800,
+        )
     for _ in range(4):
-        planter(b, rng, at(rng.uniform(-3, 3), -0.2, back + rng.uniform(2, 6)), rng.uniform(0.6, 1.0))
+        planter(
+            b, rng, at(rng.uniform(-3, 3), -0.2, back + rng.uniform(2, 6)), rng.uniform(0.6, 1.0)
+        )
 
 
 def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
@@ -181,19 +302,62 @@ def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
     for x, way in ((-half + 0.03, [0, 0, 1.0]), (half - 0.03, [0, 0, -1.0])):
         for z in np.arange(4.0, back - 0.8, 0.9):
             size = rng.uniform(0.45, 0.7)
-            b.panel("poster", at(x, rng.uniform(1.9, 2.6), z), np.asarray(way) * size, [0, size * 1.2, 0], cell=cell(rng))
-    b.panel("cloth", at(-1.4, 0.015, 6.4), [2.8, 0, 0], [0, 0, -2.4], tile=1.4, tint=rng.uniform(0.3, 1.0, 3), step=0.12)
-    table(b, rng, at(rng.uniform(-0.9, 0.9), 0, rng.uniform(4.6, 5.4)), rng.uniform(-0.35, 0.35), lamps)
+            b.panel(
+                "poster",
+                at(x, rng.uniform(1.9, 2.6), z),
+                np.asarray(way) * size,
+                [0, size * 1.2, 0],
+                cell=cell(rng),
+            )
+    b.panel(
+        "cloth",
+        at(-1.4, 0.015, 6.4),
+        [2.8, 0, 0],
+        [0, 0, -2.4],
+        tile=1.4,
+        tint=rng.uniform(0.3, 1.0, 3),
+        step=0.12,
+    )
+    table(
+        b,
+        rng,
+        at(rng.uniform(-0.9, 0.9), 0, rng.uniform(4.6, 5.4)),
+        rng.uniform(-0.35, 0.35),
+        lamps,
+    )
     for side in (-1, 1):
-        pot_plant(b, rng, at(side * rng.uniform(1.7, 2.5), 0, rng.uniform(4.0, 5.5)), rng.uniform(0.8, 1.1))
+        pot_plant(
+            b,
+            rng,
+            at(side * rng.uniform(1.7, 2.5), 0, rng.uniform(4.0, 5.5)),
+            rng.uniform(0.8, 1.1),
+        )
     for x in rng.uniform(-2.2, 2.2, 2):
         z, drop = rng.uniform(4.5, 6.0), rng.uniform(0.7, 1.0)
         b.tube("metal", [at(x, tall, z), at(x, tall - drop, z)], 0.012)
-        b.lathe("metal", at(x, tall - drop - 0.25, z), [(0.03, 0.26), (0.1, 0.2), (0.24, 0.0)], sides=18, tint=rng.uniform(0.5, 2.5, 3))
-        b.ball("paint", at(x, tall - drop - 0.24, z), np.full(3, 0.07), glow=4.0, tint=(1, 0.85, 0.6))
+        b.lathe(
+            "metal",
+            at(x, tall - drop - 0.25, z),
+            [(0.03, 0.26), (0.1, 0.2), (0.24, 0.0)],
+            sides=18,
+            tint=rng.uniform(0.5, 2.5, 3),
+        )
+        b.ball(
+            "paint", at(x, tall - drop - 0.24, z), np.full(3, 0.07), glow=1.5, tint=(1, 0.85, 0.6)
+        )
         lamps.append((tuple(float(v) for v in at(x, tall - drop - 0.36, z)), (2.2, 1.7, 1.1)))
+    # Lamps behind the camera, out of its sight.
+    for x in (-1.6, 1.6):
+        lamps.append((tuple(float(v) for v in at(x, tall - 0.5, -0.3)), (5.5, 4.8, 3.9)))
     for _ in range(4):
         spot = at(rng.uniform(-2.5, 2.5), 0, rng.uniform(3.8, 6.5))
-        b.box("wood", spot - [0, 0.18, 0], (0.5, 0.36, 0.4), yaw=rng.uniform(-1, 1), tile=0.5, tint=rng.uniform(0.6, 1.4) * np.ones(3))
-        thing(b, rng, (spot - [0, 0.36, 0]).astype(np.float32), 0.26)
+        b.box(
+            "wood",
+            spot - offset(0, 0.18, 0),
+            (0.5, 0.36, 0.4),
+            yaw=rng.uniform(-1, 1),
+            tile=0.5,
+            tint=rng.uniform(0.6, 1.4) * np.ones(3),
+        )
+        thing(b, rng, (spot - offset(0, 0.36, 0)).astype(np.float32), 0.26)
     return b, lamps

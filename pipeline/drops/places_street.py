@@ -5,18 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.drops import places_textures as tx
-from pipeline.drops.places_parts import Array, Builder, Cell, turn
+from pipeline.drops.places_parts import Array, Builder, Cell
+from pipeline.drops.places_things import (
+    at,
+    bench,
+    bin_,
+    cell,
+    lamp_post,
+    notice,
+    planter,
+    railing,
+    stall,
+    tree,
+    wires,
+)
 
 Rng = np.random.Generator
-EYE = 1.6  # height of the camera above the ground, metres
 WALLS = ((0.80, 0.72, 0.58), (0.75, 0.52, 0.40), (0.60, 0.66, 0.66), (0.82, 0.78, 0.72),
          (0.70, 0.62, 0.40), (0.62, 0.44, 0.42), (0.55, 0.62, 0.50))  # fmt: skip
-PAINTS = ((0.12, 0.26, 0.22), (0.42, 0.12, 0.10), (0.12, 0.20, 0.36), (0.85, 0.83, 0.78), (0.25, 0.18, 0.13))
-
-
-def at(x: float, h: float, z: float) -> Array:
-    """Point at height `h` above the ground, in the frame of the place."""
-    return np.array([x, EYE - h, z], np.float32)
+PAINTS = (
+    (0.12, 0.26, 0.22),
+    (0.42, 0.12, 0.10),
+    (0.12, 0.20, 0.36),
+    (0.85, 0.83, 0.78),
+    (0.25, 0.18, 0.13),
+)
 
 
 def textures(rng: Rng) -> dict[str, Array]:
@@ -45,20 +58,24 @@ def textures(rng: Rng) -> dict[str, Array]:
     }
 
 
-def cell(rng: Rng, columns: int = 4, rows: int = 4) -> Cell:
-    """A random cell of an atlas."""
-    return Cell(int(rng.integers(0, columns)), int(rng.integers(0, rows)), columns, rows)
-
-
-def window(b: Builder, rng: Rng, middle: Array, right: Array, w: float, h: float, paint: Array) -> None:
+def window(
+    b: Builder, rng: Rng, middle: Array, right: Array, w: float, h: float, paint: Array
+) -> None:
     """Window in a wall: pane, frame, cross bars, sill and perhaps shutters; `right` is a unit."""
     out = np.cross(np.array([0, 1, 0], np.float32), right)
     yaw = float(np.arctan2(-right[2], right[0]))
     corner = middle - right * w / 2 - np.array([0, h / 2, 0], np.float32) + out * 0.02
     b.panel("window", corner, right * w, [0, h, 0], cell=cell(rng), step=0.5)
     white = (0.95, 0.94, 0.9) if rng.random() < 0.7 else paint
-    for dx, dy, sx, sy in ((-w / 2, 0, 0.07, h + 0.07), (w / 2, 0, 0.07, h + 0.07), (0, -h / 2, w, 0.07),
-                           (0, h / 2, w, 0.07), (0, 0, 0.05, h), (0, -h * 0.15, w, 0.04)):  # fmt: skip
+    bars = (
+        (-w / 2, 0, 0.07, h + 0.07),
+        (w / 2, 0, 0.07, h + 0.07),
+        (0, -h / 2, w, 0.07),
+        (0, h / 2, w, 0.07),
+        (0, 0, 0.05, h),
+        (0, -h * 0.15, w, 0.04),
+    )
+    for dx, dy, sx, sy in bars:
         p = middle + right * dx + np.array([0, dy, 0], np.float32) + out * 0.05
         b.box("paint", p, (sx, sy, 0.10), yaw=yaw, tint=white, step=0.6)
     sill = middle + np.array([0, h / 2 + 0.08, 0], np.float32) + out * 0.1
@@ -66,15 +83,34 @@ def window(b: Builder, rng: Rng, middle: Array, right: Array, w: float, h: float
     if rng.random() < 0.45:
         for side in (-1, 1):
             p = middle + right * side * (w * 0.5 + 0.27) + out * 0.06
-            b.box("wood", p, (0.42, h, 0.06), yaw=yaw, tint=np.asarray(paint) * 1.9, tile=0.8, step=0.4)
+            b.box(
+                "wood",
+                p,
+                (0.42, h, 0.06),
+                yaw=yaw,
+                tint=np.asarray(paint) * 1.9,
+                tile=0.8,
+                step=0.4,
+            )
     elif rng.random() < 0.5:
         n = 60
         box = middle + np.array([0, h / 2 - 0.06, 0], np.float32) + out * 0.22
         b.box("wood", box, (w * 0.9, 0.18, 0.2), yaw=yaw, step=0.5)
-        spot = box + right * rng.uniform(-w * 0.45, w * 0.45, (n, 1)) + rng.uniform(-0.12, 0.12, (n, 3))
+        spot = (
+            box
+            + right * rng.uniform(-w * 0.45, w * 0.45, (n, 1))
+            + rng.uniform(-0.12, 0.12, (n, 3))
+        )
         spot = spot - np.array([0, 0.18, 0])
         bloom = np.where(rng.random((n, 1)) < 0.4, [[2.2, 0.5, 0.6]], [[1.0, 1.0, 1.0]])
-        b.leaves("leaf", spot, np.tile(out - [0, 0.6, 0], (n, 1)), 0.13, rng, tint=np.repeat(bloom, 4, 0).reshape(n, 4, 3))
+        b.leaves(
+            "leaf",
+            spot,
+            np.tile(out - [0, 0.6, 0], (n, 1)),
+            0.13,
+            rng,
+            tint=np.repeat(bloom, 4, 0).reshape(n, 4, 3),
+        )
 
 
 def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, paint: Array) -> None:
@@ -82,7 +118,13 @@ def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, pa
     out = np.cross(np.array([0, 1, 0], np.float32), right)
     yaw = float(np.arctan2(-right[2], right[0]))
     up = np.array([0, -1, 0], np.float32)
-    b.box("wood", left + right * width / 2 + up * 0.35 + out * 0.06, (width, 0.7, 0.12), yaw=yaw, tint=paint * 2.2)
+    b.box(
+        "wood",
+        left + right * width / 2 + up * 0.35 + out * 0.06,
+        (width, 0.7, 0.12),
+        yaw=yaw,
+        tint=paint * 2.2,
+    )
     door = rng.uniform(0.2, 0.8) * (width - 1.0)
     for start, end in ((0.15, door), (door + 1.0, width - 0.15)):
         n = max(1, round((end - start) / 1.1))
@@ -93,27 +135,41 @@ def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, pa
                 window(b, rng, p, right, w - 0.1, 1.4, paint)
     p = left + right * (door + 0.5) + up * 1.05 + out * 0.05
     b.box("wood", p, (0.9, 2.1, 0.1), yaw=yaw, tint=paint * 1.6, tile=0.9)
-    b.panel("window", p - right * 0.3 + up * 0.85 + out * 0.06, right * 0.6, [0, 0.9, 0], cell=cell(rng))
+    b.panel(
+        "window", p - right * 0.3 + up * 0.85 + out * 0.06, right * 0.6, [0, 0.9, 0], cell=cell(rng)
+    )
     word = Cell(0, int(rng.integers(0, len(tx.WORDS))), 1, len(tx.WORDS))
     board = left + right * 0.2 + up * 2.86 + out * 0.12
     b.panel("sign", board, right * (width - 0.4), [0, 0.52, 0], cell=word, step=0.3)
-    b.box("wood", left + right * width / 2 + up * 2.6 + out * 0.05, (width - 0.2, 0.62, 0.1), yaw=yaw, tint=paint * 2)
+    b.box(
+        "wood",
+        left + right * width / 2 + up * 2.6 + out * 0.05,
+        (width - 0.2, 0.62, 0.1),
+        yaw=yaw,
+        tint=paint * 2,
+    )
     if rng.random() < 0.6:
         span = rng.uniform(0.5, 0.9) * width
         top = left + right * rng.uniform(0, width - span) + up * 2.35 + out * 0.1
         colour = np.clip(rng.uniform(0.3, 1.2, 3), 0, 1.0)
         b.panel("cloth", top, right * span, out * 1.0 - up * 0.45, tile=1.6, tint=colour, step=0.2)
-        b.panel("cloth", top + out * 1.0 - up * 0.45, right * span, -up * 0.18, tile=1.6, tint=colour)
+        b.panel(
+            "cloth", top + out * 1.0 - up * 0.45, right * span, -up * 0.18, tile=1.6, tint=colour
+        )
 
 
 def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height: float) -> None:
-    """Front of a house from its ground-left corner along the unit `right`, with roof and chimney."""
+    """Front of a house, from its ground-left corner along the unit `right`, roof and chimney."""
     out = np.cross(np.array([0, 1, 0], np.float32), right)
     yaw = float(np.arctan2(-right[2], right[0]))
     up = np.array([0, -1, 0], np.float32)
     paint = np.asarray(PAINTS[int(rng.integers(0, len(PAINTS)))], np.float32)
     kind = ("brick", "plaster", "stone")[int(rng.choice(3, p=(0.45, 0.4, 0.15)))]
-    tint = np.asarray(WALLS[int(rng.integers(0, len(WALLS)))]) * 1.15 if kind == "plaster" else rng.uniform(0.8, 1.15, 3)
+    tint = (
+        np.asarray(WALLS[int(rng.integers(0, len(WALLS)))]) * 1.15
+        if kind == "plaster"
+        else rng.uniform(0.8, 1.15, 3)
+    )
     wall = {"tile": 1.6, "tint": tint, "shift": tuple(rng.random(2))}
     b.panel(kind, left + up * height, right * width, -up * height, **wall)
     for end in (left, left + right * width):  # the gable ends
@@ -121,11 +177,24 @@ def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
         b.panel(kind, end + up * height, -out * 3, -up * height, **wall)
         b.box("stone", end + up * height / 2 + out * 0.03, (0.18, height, 0.1), yaw=yaw, tile=0.8)
     for level in (0.12, 2.98, height - 0.06):
-        b.box("stone", left + right * width / 2 + up * level + out * 0.06, (width, 0.16, 0.16), yaw=yaw, tile=0.8)
+        b.box(
+            "stone",
+            left + right * width / 2 + up * level + out * 0.06,
+            (width, 0.16, 0.16),
+            yaw=yaw,
+            tile=0.8,
+        )
     ridge = rng.uniform(1.2, 2.0)
     eave = left + up * height + out * 0.35 - right * 0.1
     slope = out * -2.4 + up * ridge
-    b.panel("tiles", eave + slope, right * (width + 0.2), -slope, tile=1.4, tint=rng.uniform(0.75, 1.15) * np.ones(3))
+    b.panel(
+        "tiles",
+        eave + slope,
+        right * (width + 0.2),
+        -slope,
+        tile=1.4,
+        tint=rng.uniform(0.75, 1.15) * np.ones(3),
+    )
     stack = eave + slope * 0.7 + right * rng.uniform(0.15, 0.85) * width
     b.box("brick", stack + up * 0.4, (0.55, 1.5, 0.5), yaw=yaw, tile=1.6, tint=(0.8, 0.75, 0.75))
     for k in (-0.12, 0.12):
@@ -137,142 +206,31 @@ def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
         for k in range(n):
             p = left + right * width * (k + 0.5) / n
             if k == n // 2:
-                b.box("wood", p + up * 1.05 + out * 0.03, (0.95, 2.1, 0.1), yaw=yaw, tint=paint * 1.7, tile=0.9)
+                b.box(
+                    "wood",
+                    p + up * 1.05 + out * 0.03,
+                    (0.95, 2.1, 0.1),
+                    yaw=yaw,
+                    tint=paint * 1.7,
+                    tile=0.9,
+                )
                 b.box("stone", p + up * 0.08 + out * 0.3, (1.3, 0.16, 0.6), yaw=yaw)
             else:
                 window(b, rng, p + up * 1.6, right, 0.85, 1.3, paint)
     columns = max(1, round(width / rng.uniform(1.25, 1.7)))
     for level in np.arange(4.0, height - 0.6, 2.2):
         for k in range(columns):
-            window(b, rng, left + right * width * (k + 0.5) / columns + up * level, right, 0.8, 1.3, paint)
+            window(
+                b,
+                rng,
+                left + right * width * (k + 0.5) / columns + up * level,
+                right,
+                0.8,
+                1.3,
+                paint,
+            )
     gutter = left + right * 0.12 + out * 0.1
     b.tube("metal", [gutter + up * height, gutter + up * 1.5, gutter], 0.05)
-
-
-def tree(b: Builder, rng: Rng, foot: Array, height: float, leaves: int = 1100) -> None:
-    """Trunk, branches and a crown of leaves."""
-    up = np.array([0, -1, 0], np.float32)
-    fork = foot + up * height * 0.45 + rng.normal(0, 0.08, 3)
-    b.tube("bark", [foot + up * -0.05, foot + up * height * 0.2, fork], [0.13, 0.10, 0.085], sides=9, tile=0.7)
-    crown = foot + up * height * 0.72
-    green = np.array([1.0, 1.0, 1.0]) * rng.uniform(0.75, 1.2) * np.array([rng.uniform(0.8, 1.5), 1, rng.uniform(0.7, 1.0)])
-    tips = []
-    for _ in range(9):
-        d = rng.standard_normal(3)
-        tip = crown + d / np.linalg.norm(d) * np.array([0.28, 0.24, 0.28]) * height * rng.uniform(0.5, 1.0)
-        tips.append(tip)
-        b.tube("bark", [fork, (fork + tip) / 2 + rng.normal(0, 0.1, 3), tip], [0.06, 0.035, 0.015], sides=5)
-    pick = rng.integers(0, len(tips), leaves)
-    spot = np.asarray(tips)[pick] + rng.normal(0, 0.105 * height, (leaves, 3)) * [1, 0.8, 1]
-    b.leaves("leaf", spot, spot - crown + up * 0.6, 0.17, rng, tint=green, spread=0.22)
-
-
-def lamp_post(b: Builder, rng: Rng, foot: Array) -> None:
-    """Street lamp, about 3.6 m."""
-    up = np.array([0, -1, 0], np.float32)
-    h = rng.uniform(3.2, 3.9)
-    b.lathe("metal", foot, [(0.05, 0.9), (0.07, 0.8), (0.08, 0.4), (0.13, 0.3), (0.15, 0.0)], sides=10)
-    b.tube("metal", [foot + up * 0.6, foot + up * h], [0.05, 0.035], sides=8)
-    top = foot + up * h
-    b.lathe("paint", top, [(0.17, 0.42), (0.10, 0.02)], sides=6, tint=(1.0, 0.95, 0.8))
-    b.lathe("metal", top, [(0.02, 0.66), (0.05, 0.58), (0.24, 0.42), (0.22, 0.40)], sides=6)
-    arm = top - up * 0.5
-    b.tube("metal", [arm + [-0.35, 0, 0], arm, arm + [0.35, 0, 0]], 0.018)
-
-
-def railing(b: Builder, rng: Rng, start: Array, end: Array) -> None:
-    """Iron railing of upright bars, about 1 m high."""
-    up = np.array([0, -1, 0], np.float32)
-    n = max(2, int(np.linalg.norm(end - start) / 0.17))
-    for h in (0.16, 0.92):
-        b.tube("metal", [start + up * h, end + up * h], 0.022, tint=(0.6, 0.7, 0.65))
-    for k in range(n + 1):
-        foot = start + (end - start) * k / n
-        thick = 0.028 if k % 8 == 0 else 0.012
-        b.tube("metal", [foot, foot + up * 1.02], thick, sides=5, tint=(0.6, 0.7, 0.65))
-
-
-def bin_(b: Builder, rng: Rng, foot: Array) -> None:
-    """Litter bin with a lid and a print on it."""
-    tint = rng.uniform(0.15, 0.6, 3)
-    shape = [(0.02, 0.95), (0.2, 0.9), (0.27, 0.8), (0.25, 0.78), (0.25, 0.4), (0.22, 0.02)]
-    b.lathe("paint", foot, shape, sides=14, tint=tint)
-    corner = foot + np.array([-0.13, -0.68, -0.262], np.float32)
-    b.panel("poster", corner, [0.26, 0, 0], [0, 0.3, 0], cell=cell(rng), step=0.15)
-
-
-def bench(b: Builder, rng: Rng, foot: Array, yaw: float) -> None:
-    """Slatted bench."""
-    r = turn(yaw)
-    tint = rng.uniform(0.7, 1.3) * np.array([1.0, 0.9, 0.8])
-    for k in range(4):
-        b.box("wood", foot + r @ np.array([0, -0.45, -0.2 + 0.12 * k]), (1.6, 0.04, 0.09), yaw=yaw, tint=tint, tile=0.7)
-    for k in range(3):
-        b.box("wood", foot + r @ np.array([0, -0.6 - 0.14 * k, 0.27]), (1.6, 0.09, 0.04), yaw=yaw, tint=tint, tile=0.7)
-    for x in (-0.65, 0.65):
-        for z in (-0.2, 0.26):
-            b.box("metal", foot + r @ np.array([x, -0.22, z]), (0.05, 0.44, 0.05), yaw=yaw)
-        b.box("metal", foot + r @ np.array([x, -0.65, 0.3]), (0.05, 0.5, 0.04), yaw=yaw)
-
-
-def stall(b: Builder, rng: Rng, foot: Array, yaw: float) -> None:
-    """Market stall: striped roof on poles, crates of fruit on a table, a lettered board."""
-    r, w, d = turn(yaw), rng.uniform(1.8, 2.4), 1.2
-
-    def p(x: float, h: float, z: float) -> Array:
-        return (foot + r @ np.array([x, -h, z])).astype(np.float32)
-
-    for x in (-w / 2, w / 2):
-        for z in (-d / 2, d / 2):
-            b.tube("wood", [p(x, 0, z), p(x, 2.1 if z < 0 else 2.5, z)], 0.03, sides=6)
-    colour = np.clip(rng.uniform(0.35, 1.3, 3), 0, 1.05)
-    over = p(-w / 2 - 0.15, 2.55, d / 2 + 0.1)
-    b.panel("cloth", over, r @ np.array([w + 0.3, 0, 0]), p(0, 2.05, -d / 2 - 0.25) - p(0, 2.55, d / 2 + 0.1), tile=1.3, tint=colour)
-    b.panel("cloth", p(-w / 2 - 0.15, 2.05, -d / 2 - 0.25), r @ np.array([w + 0.3, 0, 0]), [0, 0.2, 0], tile=1.3, tint=colour)
-    b.box("wood", p(0, 0.78, 0), (w, 0.06, d), yaw=yaw, tile=0.8)
-    word = Cell(0, int(rng.integers(0, len(tx.WORDS))), 1, len(tx.WORDS))
-    b.panel("sign", p(-w * 0.4, 0.62, -d / 2 - 0.03), r @ np.array([w * 0.8, 0, 0]), [0, 0.32, 0], cell=word, step=0.2)
-    b.box("wood", p(0, 0.4, -d / 2 + 0.05), (w - 0.1, 0.72, 0.05), yaw=yaw, tile=0.6, tint=(0.7, 0.65, 0.6))
-    for k in range(4):
-        x = -w / 2 + w * (k + 0.5) / 4
-        b.box("wood", p(x, 0.9, -0.15), (w / 4 - 0.06, 0.18, 0.6), yaw=yaw, tile=0.3, tint=(1.2, 1.1, 0.9))
-        fruit = np.asarray(((0.95, 0.45, 0.1), (0.8, 0.15, 0.12), (0.55, 0.75, 0.2), (0.95, 0.8, 0.25)))[rng.integers(0, 4)]
-        for _ in range(14):
-            spot = p(x + rng.uniform(-0.5, 0.5) * (w / 4 - 0.15), 1.01 + rng.uniform(0, 0.06), -0.15 + rng.uniform(-0.24, 0.24))
-            b.ball("paint", spot, np.full(3, rng.uniform(0.05, 0.075)), sides=8, tint=fruit * rng.uniform(0.8, 1.15))
-
-
-def planter(b: Builder, rng: Rng, foot: Array, size: float = 0.5, leaves: int = 160) -> None:
-    """Box of earth with a shrub."""
-    up = np.array([0, -1, 0], np.float32)
-    b.box("wood", foot + up * size * 0.4, (size * 1.3, size * 0.8, size * 1.3), tile=0.6, tint=rng.uniform(0.7, 1.2, 3))
-    middle = foot + up * size * 1.35
-    spot = middle + rng.normal(0, 0.33 * size, (leaves, 3))
-    bloom = np.where(rng.random((leaves, 1, 1)) < 0.15, rng.uniform(0.6, 2.5, 3), [1.0, 1.05, 0.9])
-    b.leaves("leaf", spot, spot - middle + up * 0.4, 0.14, rng, tint=np.broadcast_to(bloom, (leaves, 4, 3)))
-
-
-def notice(b: Builder, rng: Rng, foot: Array) -> None:
-    """Board of prints on two posts."""
-    up = np.array([0, -1, 0], np.float32)
-    for x in (-0.55, 0.55):
-        b.tube("metal", [foot + [x, 0, 0], foot + [x, 0, 0] + up * 1.9], 0.035)
-    b.box("wood", foot + up * 1.35, (1.1, 0.95, 0.06), tile=0.5)
-    for k in range(2):
-        b.panel("poster", foot + up * 1.78 + np.array([-0.5 + 0.52 * k, 0, -0.05], np.float32), [0.48, 0, 0], [0, 0.82, 0], cell=cell(rng), step=0.15)
-
-
-def wires(b: Builder, rng: Rng) -> None:
-    """Cables and a string of pennants across the street."""
-    for _ in range(2):
-        h0, h1, z = rng.uniform(4.2, 5.2), rng.uniform(4.2, 5.2), rng.uniform(6.5, 9)
-        s = np.linspace(0, 1, 24)
-        line = np.stack([-8 + 16 * s, EYE - (h0 + (h1 - h0) * s - 2.0 * s * (1 - s)), np.full(24, z)], 1)
-        b.tube("metal", line, 0.012, sides=4)
-        for p in line[1:-1]:
-            colour = rng.uniform(0.15, 1.0, 3)
-            v = [p + [-0.13, 0, 0], p + [0.13, 0, 0], p + [0, 0.3, 0]]
-            b.add("cloth", v, np.tile([0, -0.2, -1.0], (3, 1)), [[0, 0], [0.05, 0], [0.02, 0.2]], [[0, 1, 2]], colour)
 
 
 def build(rng: Rng) -> Builder:
@@ -286,17 +244,33 @@ def build(rng: Rng) -> Builder:
     while x < 11:
         width = rng.uniform(3.0, 4.6)
         if x < gap < x + width:
-            house(b, rng, at(x - 0.6, 0, depth + rng.uniform(4.0, 4.8)), np.array([1, 0, 0], np.float32), width + 1.2, 5.4)
+            house(
+                b,
+                rng,
+                at(x - 0.6, 0, depth + rng.uniform(4.0, 4.8)),
+                np.array([1, 0, 0], np.float32),
+                width + 1.2,
+                5.4,
+            )
             bin_(b, rng, at(x + 0.5, 0, depth + 1.5))
             planter(b, rng, at(x + width - 0.6, 0, depth + 0.8))
         else:
-            house(b, rng, at(x, 0, depth + rng.uniform(-0.7, 0.9)), np.array([1, 0, 0], np.float32), width, rng.uniform(4.4, 6.4))
+            house(
+                b,
+                rng,
+                at(x, 0, depth + rng.uniform(-0.7, 0.9)),
+                np.array([1, 0, 0], np.float32),
+                width,
+                rng.uniform(4.4, 6.4),
+            )
         x += width
     for side in (-1, 1):
         if rng.random() < 0.6:  # a wing that comes towards the camera
             edge = side * rng.uniform(4.4, 5.4)
             near, far = rng.uniform(6.6, 7.2), 9.6
-            start, along = (at(edge, 0, near), [0, 0, 1.0]) if side < 0 else (at(edge, 0, far), [0, 0, -1.0])
+            start, along = (
+                (at(edge, 0, near), [0, 0, 1.0]) if side < 0 else (at(edge, 0, far), [0, 0, -1.0])
+            )
             house(b, rng, start, np.asarray(along, np.float32), far - near, rng.uniform(4.4, 5.6))
     slots = list(rng.permutation(np.linspace(-3.6, 3.6, 7)))
     for x in slots[:2]:
@@ -308,13 +282,17 @@ def build(rng: Rng) -> Builder:
     lamp_post(b, rng, at(-slots[5], 0, rng.uniform(8.0, 9.5)))
     start = rng.uniform(-3.2, 0.6)
     z = rng.uniform(4.3, 4.9)
-    railing(b, rng, at(start, -0.12, z), at(start + rng.uniform(2.0, 3.0), -0.12, z + rng.uniform(-0.2, 0.2)))
+    railing(
+        b,
+        rng,
+        at(start, -0.12, z),
+        at(start + rng.uniform(2.0, 3.0), -0.12, z + rng.uniform(-0.2, 0.2)),
+    )
     for _ in range(3):
         bin_(b, rng, at(rng.uniform(-4, 4), 0, rng.uniform(6.7, 9.0)))
         planter(b, rng, at(rng.uniform(-4.5, 4.5), 0, rng.uniform(6.7, 9.4)), rng.uniform(0.4, 0.6))
-    planter(b, rng, at(rng.uniform(1.2, 2.2) * rng.choice([-1, 1]), -0.12, rng.uniform(4.0, 4.6)), 0.45)
+    planter(
+        b, rng, at(rng.uniform(1.2, 2.2) * rng.choice([-1, 1]), -0.12, rng.uniform(4.0, 4.6)), 0.45
+    )
     wires(b, rng)
     return b
-
-
-

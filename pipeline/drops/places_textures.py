@@ -153,8 +153,12 @@ def windows(rng: Rng, *, cell: int = 128, cells: int = 4) -> Array:
 def signs(rng: Rng, *, width: int = 512, height: int = 96) -> Array:
     """Atlas of lettered boards, one word of WORDS per row."""
     boards = []
-    palette = [((0.10, 0.22, 0.18), (0.92, 0.86, 0.65)), ((0.86, 0.82, 0.72), (0.35, 0.10, 0.10)),
-               ((0.15, 0.18, 0.32), (0.95, 0.93, 0.88)), ((0.62, 0.16, 0.13), (0.97, 0.92, 0.80))]  # fmt: skip
+    palette = [
+        ((0.10, 0.22, 0.18), (0.92, 0.86, 0.65)),
+        ((0.86, 0.82, 0.72), (0.35, 0.10, 0.10)),
+        ((0.15, 0.18, 0.32), (0.95, 0.93, 0.88)),
+        ((0.62, 0.16, 0.13), (0.97, 0.92, 0.80)),
+    ]
     for i, word in enumerate(WORDS):
         back, ink = palette[(i + int(rng.integers(0, 4))) % 4]
         board = np.full((height, width, 3), np.multiply(back, 255), np.uint8)

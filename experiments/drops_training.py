@@ -1,0 +1,81 @@
+"""Ray-traced pairs (rainy, coverage, clean) for training the drop detector.
+
+`python experiments/drops_training.py OUT --seeds 100 110 --views 8` writes
+OUT/{rainy,coverage,clean}/NNN.png. Even seeds are streets, odd ones rooms. Every view has a drop
+pattern, a pane and an aperture of its own, unless --shared fixes one pattern to the lens per seed.
+Seeds below 100 are left to the scenes that detectors are judged on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from pipeline.drops import mitsuba_scene, places, synthesis
+from pipeline.drops.shape import Drop
+from pipeline.errors import UserError
+from pipeline.io.images import write_image
+
+WIDTH, HEIGHT = 400, 300
+
+
+def random_pane(
+    rng: np.random.Generator, light: bool
+) -> tuple[mitsuba_scene.Camera, float, list[Drop]]:
+    """A camera, the distance of its pane and the drops on it; `light`: as on the judged scenes."""
+    focal = synthesis.focal_px(WIDTH, float(rng.uniform(50, 70)))
+    while True:
+        pane = 0.12 if light else float(rng.uniform(0.06, 0.25))
+        aperture = 0.001 if light else float(rng.uniform(0, 0.002))
+        camera = mitsuba_scene.Camera(WIDTH, HEIGHT, focal, aperture)
+        small = float(rng.uniform(1.0, 2.5))
+        radii = (small, float(rng.uniform(small + 1, 5.0 if light else 9.0)))
+        share = float(rng.uniform(0.08, 0.18) if light else rng.uniform(0.05, 0.35))
+        try:
+            return camera, pane, synthesis.lens_drops(rng, camera, pane, share, radii)
+        except UserError:  # too dense for these sizes: draw again
+            continue
+
+
+def make(out: Path, seeds: range, views: int, spp: int, shared: bool) -> None:
+    """Renders the pairs that `out` does not hold yet."""
+    for folder in ("rainy", "coverage", "clean"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    for index, seed in enumerate(tqdm(seeds, desc="places")):
+        names = [f"{index * views + k:03d}.png" for k in range(views)]
+        if all((out / "rainy" / name).exists() for name in names):
+            continue
+        place = places.build(places.NAMES[seed % len(places.NAMES)], seed)
+        baked = mitsuba_scene.bake_place(place, rays=96)
+        rng = np.random.default_rng([seed, 3])
+        poses = mitsuba_scene.trajectory(rng, views, turn_deg=5.0)
+        pane = random_pane(rng, light=True)
+        exposure = synthesis.place_exposure(baked, pane[0])
+        for k, name in enumerate(names):
+            camera, pane_m, drops = pane if shared else random_pane(rng, light=False)
+            view = synthesis.wet_view(
+                baked, camera, poses[k], drops, exposure=exposure * float(rng.uniform(0.7, 1.3)),
+                spp=spp, clean_spp=spp, seed=seed * 1009 + k, pane_m=pane_m,
+            )  # fmt: skip
+            write_image(out / "clean" / name, view.clean)
+            write_image(out / "coverage" / name, np.repeat(view.coverage[..., None], 3, 2))
+            write_image(out / "rainy" / name, view.rainy)
+
+
+def main() -> None:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seeds", type=int, nargs=2, required=True, metavar=("FIRST", "END"))
+    parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--spp", type=int, default=32)
+    parser.add_argument("--shared", action="store_true", help="one drop pattern per place")
+    flags = parser.parse_args()
+    make(flags.out, range(*flags.seeds), flags.views, flags.spp, flags.shared)
+
+
+if __name__ == "__main__":
+    main()

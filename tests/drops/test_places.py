@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.drops import places
+from pipeline.drops.places_parts import Builder, Cell
+from pipeline.errors import UserError
+
+
+@pytest.fixture(scope="module", params=places.NAMES)
+def place(request: pytest.FixtureRequest) -> places.Place:
+    return places.build(request.param, 5)
+
+
+def test_same_seed_same_place_and_another_seed_another_layout(place: places.Place) -> None:
+    again = places.build(place.name, 5)
+    other = places.build(place.name, 6)
+    for a, b in zip(place.meshes, again.meshes, strict=True):
+        for field in ("vertices", "normals", "uv", "tint", "glow", "faces", "texture"):
+            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    np.testing.assert_array_equal(place.sky, again.sky)
+    assert [len(m.vertices) for m in place.meshes] != [len(m.vertices) for m in other.meshes]
+
+
+def test_meshes_are_valid(place: places.Place) -> None:
+    for mesh in place.meshes:
+        n = len(mesh.vertices)
+        assert mesh.faces.min() >= 0 and mesh.faces.max() < n
+        assert mesh.normals.shape == mesh.vertices.shape == mesh.tint.shape == (n, 3)
+        assert mesh.uv.shape == (n, 2) and mesh.glow.shape == (n,)
+        for values in (mesh.vertices, mesh.normals, mesh.uv, mesh.tint, mesh.texture):
+            assert np.isfinite(values).all()
+        assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-4
+        assert mesh.texture.min() >= 0 and mesh.texture.max() <= 1
+        assert mesh.tint.min() >= 0 and mesh.glow.min() >= 0
+
+
+def test_atlases_are_never_read_outside_their_border(place: places.Place) -> None:
+    atlases = [m for m in place.meshes if m.name in ("window", "sign", "poster", "spine")]
+    for mesh in (m for m in atlases if m.name != "poster" or place.name == "street"):
+        assert mesh.uv.min() > 0 and mesh.uv.max() < 1
+
+
+def test_place_has_depth_and_nothing_touches_the_cameras(place: places.Place) -> None:
+    points = np.concatenate([m.vertices for m in place.meshes])
+    ahead = points[(points[:, 2] > 0.5) & (np.abs(points[:, 0]) < 0.55 * points[:, 2])]
+    near, far = np.percentile(ahead[:, 2], [2, 99])
+    assert near < 6.5 and far > 8
+    assert np.linalg.norm(points, axis=1).min() > 1.0
+
+
+def test_panel_faces_the_viewer_with_its_texture_upright() -> None:
+    b = Builder({"a": np.ones((2, 2, 3), np.float32)})
+    b.panel("a", [-1, -1, 5], [2, 0, 0], [0, 2, 0], cell=Cell(1, 0, 2, 1), step=3)
+    (mesh,) = b.meshes()
+    np.testing.assert_allclose(mesh.normals, np.tile([0, 0, -1], (4, 1)), atol=1e-6)
+    left, top = mesh.vertices[:, 0] < 0, mesh.vertices[:, 1] < 0
+    np.testing.assert_allclose(mesh.uv[left, 0], 0.505, atol=1e-6)
+    np.testing.assert_allclose(mesh.uv[top, 1], 0.01, atol=1e-6)
+    a, c, d = (mesh.vertices[mesh.faces[0][k]] for k in range(3))
+    assert np.cross(c - a, d - a) @ [0, 0, -1] > 0
+
+
+def test_box_normals_point_out() -> None:
+    b = Builder({"a": np.ones((2, 2, 3), np.float32)})
+    b.box("a", [1, 2, 3], [1, 2, 0.5], yaw=0.4)
+    (mesh,) = b.meshes()
+    assert ((mesh.vertices - [1, 2, 3]) * mesh.normals).sum(1).min() > 0.2
+
+
+def test_unknown_place_is_refused() -> None:
+    with pytest.raises(UserError, match="atlantis"):
+        places.build("atlantis", 1)
