@@ -83,7 +83,7 @@ def _files(job: Job, records: Sequence[ImageRecord]) -> dict[str, Files]:
             photo=paths.images / record.name,
             keep_mask=paths.masks / record.name,
             test=view("test", record.name),
-            fitted=view("input", record.name),
+            fitted=view("input", record.name) or view("test", record.name),
             composite=view("composite", record.name),
             clean=clean[record.name] if clean else None,
             coverage=coverage[record.name] if coverage else None,

@@ -1,0 +1,1 @@
+"""One self-contained page about a scene: pictures, numbers, curves and what is missing."""

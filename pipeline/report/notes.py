@@ -1,0 +1,44 @@
+"""Short sentences of the page about masks, poses and single photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_MODES = {
+    "lens-fixed": "The drops stay where they are on the lens",
+    "per-image": "Each photo has drops of its own",
+}
+_PHOTO = (
+    ("masks.coverage", "{:.1%} dropped"),
+    ("input.psnr", "as taken {:.2f} dB"),
+    ("composite.psnr", "cleaned {:.2f} dB"),
+    ("fitted.psnr", "clean view {:.2f} dB"),
+)
+
+
+def photo_notes(row: Mapping[str, float], seen: Mapping[str, float]) -> list[str]:
+    """What is known of one photo. row: its numbers of metrics.csv; seen: its entry of seen.json."""
+    notes = [text.format(row[name]) for name, text in _PHOTO if name in row]
+    if "never" in seen:
+        notes.append(f"{seen['never']:.1%} seen by no fitted photo")
+    return notes
+
+
+def masks_note(about: Mapping[str, Any]) -> str:
+    """How the masks were made, from masks.json."""
+    if not about:
+        return "Nothing is known of how the masks were made."
+    mode = _MODES.get(str(about.get("mode")), "The masks were made as they are")
+    return f"{mode}: {about.get('why', 'for no given reason')}. Threshold {about.get('threshold')}."
+
+
+def poses_note(account: Mapping[str, Any], total: int) -> str:
+    """How many photos were placed and how well, from poses.json."""
+    if not account:
+        return "Nothing is known of how the photos were placed."
+    note = f"{len(account.get('registered', []))} of {total} photos were placed"
+    if "points" in account and "reprojection_px" in account:
+        error = account["reprojection_px"]
+        note += f"; {account['points']} points, {error:.2f} px off on average"
+    return note + "."

@@ -1,0 +1,132 @@
+"""The numbers of the page: a headline, tiles, a table and what could not be had."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+# Heading of the group, label, dotted name, format, whether more is better (None: neither).
+ROWS: tuple[tuple[str, str, str, str, bool | None], ...] = (
+    ("Held-out views", "PSNR, dB", "test.psnr", ".2f", True),
+    ("Held-out views", "SSIM", "test.ssim", ".4f", True),
+    ("Held-out views", "LPIPS", "test.lpips", ".4f", False),
+    ("Held-out views", "PSNR under the drops, dB", "covered.psnr", ".2f", True),
+    ("Held-out views", "PSNR beside the drops, dB", "kept.psnr", ".2f", True),
+    (
+        "Held-out views",
+        "PSNR to the photos beside the drops, dB",
+        "selfcheck.kept_psnr",
+        ".2f",
+        True,
+    ),
+    ("Cleaned photos", "PSNR, dB", "composite.psnr", ".2f", True),
+    ("Cleaned photos", "SSIM", "composite.ssim", ".4f", True),
+    ("Cleaned photos", "PSNR under the drops, dB", "composite.covered_psnr", ".2f", True),
+    ("Photos as taken", "PSNR, dB", "input.psnr", ".2f", True),
+    ("Photos as taken", "SSIM", "input.ssim", ".4f", True),
+    ("Photos as taken", "PSNR under the drops, dB", "input.covered_psnr", ".2f", True),
+    ("Masks", "IoU with the true drops", "masks.iou", ".3f", True),
+    ("Masks", "Precision", "masks.precision", ".3f", True),
+    ("Masks", "Recall", "masks.recall", ".3f", True),
+    ("Masks", "Share of pixels dropped", "masks.coverage", ".3f", None),
+    ("Poses", "Photos placed", "poses.registered", "d", None),
+    ("Poses", "Turn off the true one, °", "poses.rotation_deg", ".3f", False),
+    ("Poses", "Place off the true one", "poses.translation", ".4f", False),
+)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A row of the table: this fit's number, the other's, how far ahead, and why one is missing."""
+
+    group: str
+    label: str
+    own: str
+    other: str
+    gain: str
+    ahead: bool | None
+    reason: str
+
+
+def value(metrics: Mapping[str, Any], name: str) -> float | None:
+    """The number at a dotted name, or None."""
+    group, leaf = name.split(".")
+    return metrics.get(group, {}).get(leaf)
+
+
+def table(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> list[Line]:
+    """The lines of the table; `other` are the numbers of the fit to compare with."""
+    lines = []
+    for group, label, name, form, rising in ROWS:
+        own = value(metrics, name)
+        theirs = value(other, name) if other else None
+        gain, ahead = "", None
+        if own is not None and theirs is not None and rising is not None and own != theirs:
+            gain = f"{own - theirs:+{form}}"
+            ahead = (own > theirs) == rising
+        reason = metrics.get(name.split(".")[0], {}).get(f"{name.split('.')[1]}_reason", "")
+        lines.append(Line(group, label, _cell(own, form), _cell(theirs, form), gain, ahead, reason))
+    return lines
+
+
+def missing(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Dotted names that have no number, gathered by their reason: (reason, names)."""
+    by_reason: dict[str, list[str]] = {}
+    for group, numbers in sorted(metrics.items()):
+        for leaf, text in sorted(numbers.items()) if isinstance(numbers, Mapping) else ():
+            if leaf.endswith("_reason"):
+                by_reason.setdefault(text, []).append(f"{group}.{leaf.removesuffix('_reason')}")
+    return [(reason, ", ".join(names)) for reason, names in by_reason.items()]
+
+
+def tiles(
+    metrics: Mapping[str, Any], other: Mapping[str, Any] | None
+) -> list[tuple[str, str, str]]:
+    """The few numbers that matter: (number, unit, what it is)."""
+    found: list[tuple[str, str, str]] = []
+    test, photo = value(metrics, "test.psnr"), value(metrics, "input.psnr")
+    theirs = value(other, "test.psnr") if other else None
+    if test is not None:
+        found.append((f"{test:.1f}", "dB", "held-out views against clean references"))
+        if theirs is not None:
+            found.append(
+                (f"{test - theirs:+.1f}", "dB", "over the same field fitted without masks")
+            )
+    elif (kept := value(metrics, "selfcheck.kept_psnr")) is not None:
+        found.append((f"{kept:.1f}", "dB", "held-out views against the photos, beside the drops"))
+    mixed = value(metrics, "composite.psnr")
+    if mixed is not None and photo is not None:
+        found.append((f"{mixed:.1f}", "dB", f"cleaned photos; as taken {photo:.1f} dB"))
+    for name, text in (("masks.iou", "IoU of the masks with the true drops"),):
+        if (score := value(metrics, name)) is not None:
+            found.append((f"{score:.2f}", "", text))
+    if (share := value(metrics, "masks.coverage")) is not None:
+        found.append((f"{100 * share:.0f}", "%", "of the pixels taken for drops"))
+    placed, total = value(metrics, "poses.registered"), value(metrics, "poses.total")
+    if placed is not None and total is not None:
+        found.append((f"{placed}/{total}", "", "photos placed"))
+    return found
+
+
+def headline(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> str:
+    """What came out, in one or two sentences."""
+    poses = (
+        f"{value(metrics, 'poses.registered')} of {value(metrics, 'poses.total')} photos placed."
+    )
+    test, ssim = value(metrics, "test.psnr"), value(metrics, "test.ssim")
+    if test is None or ssim is None:
+        kept = value(metrics, "selfcheck.kept_psnr")
+        text = "Without clean references the views cannot be judged under the drops"
+        text += f"; beside them they match the photos to {kept:.1f} dB" if kept is not None else ""
+        return f"{text}. {poses}"
+    text = f"Views held out of the fit come within {test:.1f} dB (SSIM {ssim:.3f}) of the dry scene"
+    theirs = value(other, "test.psnr") if other else None
+    if theirs is not None:
+        word = "better" if test >= theirs else "worse"
+        text += f", {abs(test - theirs):.1f} dB {word} than the same field fitted without masks"
+    return f"{text}. {poses}"
+
+
+def _cell(number: float | None, form: str) -> str:
+    return "–" if number is None else format(int(number) if form == "d" else number, form)

@@ -1,0 +1,92 @@
+"""The page to look at: `report/index.html`, one file with pictures, numbers and curves inside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import publish_dir, read_json, write_text
+from pipeline.io.paths import ScenePaths
+from pipeline.io.scene import ImageRecord, read_images_json
+from pipeline.parallel import map_named
+from pipeline.report import gather, notes, numbers
+from pipeline.report.page import Page, Photo, render
+from pipeline.report.plots import charts
+from pipeline.stage import Job, Section, run
+
+
+class Params(Section):
+    """The section `report` of params.yaml."""
+
+    compare: str | None
+    picture_size: Annotated[int, Field(ge=64, le=4096)]
+    quality: Annotated[int, Field(ge=1, le=100)]
+
+
+def main(job: Job, params: Params) -> str:
+    """Makes `report/index.html`; returns where it is."""
+    paths = job.paths
+    if job.variant is not None:
+        raise UserError(
+            "a variant has no page of its own; the scene's page shows it beside the scene.",
+            f"Set report.compare: {job.variant} and leave --variant away.",
+        )
+    metrics = read_json(paths.metrics, made_by="evaluate")
+    other_paths = ScenePaths(job.root, job.scene, params.compare) if params.compare else None
+    other = gather.optional_json(other_paths.metrics) if other_paths else {}
+    compared = params.compare if params.compare and other else ""
+    records = read_images_json(paths.images)
+    pictures = map_named(
+        gather.photo_pictures,
+        {r.name: (paths, r, params.picture_size, params.quality) for r in records},
+        job_label="report",
+        scheduler=job.scheduler,
+    )
+    account = gather.optional_json(paths.poses / "poses.json")
+    lost = gather.lost_images(account)
+    rows = gather.image_numbers(paths.metrics_csv)
+    seen = gather.optional_json(paths.views / "seen.json")
+    heat, heat_max = gather.coverage_heat(paths, records, params.picture_size, params.quality)
+    film, film_missing = gather.video(paths.views / "path.mp4")
+    page = Page(
+        scene=job.scene,
+        headline=numbers.headline(metrics, other),
+        tiles=numbers.tiles(metrics, other),
+        table=numbers.table(metrics, other),
+        compared=compared,
+        photos=[
+            _photo(
+                r,
+                pictures[r.name],
+                notes.photo_notes(rows.get(r.name, {}), seen.get(r.name, {})),
+                dict(lost).get(r.name, ""),
+            )
+            for r in records
+        ],
+        charts=charts(paths, other_paths if compared else None, records),
+        coverage=heat,
+        coverage_max=heat_max,
+        masks_note=notes.masks_note(gather.optional_json(paths.masks / "masks.json")),
+        poses_note=notes.poses_note(account, len(records)),
+        lost=lost,
+        video=film,
+        video_missing=film_missing,
+        missing=numbers.missing(metrics),
+        conventions=metrics.get("conventions", {}),
+    )
+    with publish_dir(paths.report) as fresh:
+        write_text(fresh / "index.html", render(page))
+    return f"open {paths.report / 'index.html'}"
+
+
+def _photo(record: ImageRecord, pictures: Mapping[str, str], notes: list[str], lost: str) -> Photo:
+    ratio = record.width / record.height
+    upright = 1 / ratio if record.turned % 180 else ratio
+    return Photo(record.name, record.split == "test", pictures, notes, lost, upright)
+
+
+if __name__ == "__main__":
+    run("report", Params, main)
