@@ -37,18 +37,18 @@ def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tupl
     """
     dense = math.prod(resolution) <= size
     steps = (1, resolution[0], resolution[0] * resolution[1]) if dense else HASH_PRIMES
-    ids, weights = [], []
-    for axis in range(3):
-        position = x[axis] * (resolution[axis] - 1)
-        cell = position.floor().clamp_(max=resolution[axis] - 2)
-        upper = position - cell
-        first = cell.to(torch.int32) * steps[axis]
-        ids.append(torch.stack([first, first + steps[axis]]))
-        weights.append(torch.stack([1.0 - upper, upper]))
-    a, b, c = ids[0][:, None, None], ids[1][None, :, None], ids[2][None, None, :]
+    last = torch.tensor([[r - 1.0] for r in resolution], dtype=x.dtype, device=x.device)
+    position = x * last
+    cell = torch.minimum(position.floor_(), last - 1.0)
+    upper = torch.addcmul(-cell, x, last)
+    stride = torch.tensor([[step] for step in steps], dtype=torch.int32, device=x.device)
+    ids = torch.stack([cell, cell + 1.0]).to(torch.int32) * stride
+    shares = torch.stack([1.0 - upper, upper])
+    a, b, c = ids[:, None, None, 0], ids[None, :, None, 1], ids[None, None, :, 2]
     rows = a + b + c if dense else (a ^ b ^ c) & (size - 1)
-    w = (weights[0][:, None] * weights[1][None])[:, :, None] * weights[2][None, None]
-    return rows.view(8, -1).t().contiguous(), w.view(8, -1).t().contiguous()
+    plane = shares[:, None, 0] * shares[None, :, 1]
+    weights = plane[:, :, None] * shares[None, None, :, 2]
+    return rows.view(8, -1).t().contiguous(), weights.view(8, -1).t().contiguous()
 
 
 def add_rows(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:

@@ -120,20 +120,14 @@ class GridField(nn.Module):
         else:
             noise = torch.rand(count, bins, generator=generator, device=delta.device)
             x = walk[:, :, :-1] + noise * step
-        x = x.reshape(3, -1)
-        row = torch.zeros(x.shape[1], dtype=torch.int32, device=x.device)
-        stride = 1
-        for axis in range(3):
-            place = x[axis] * sizes[axis]
-            if generator is not None:
-                # Half a cell of noise: on average the nearest cell is the trilinear mixture.
-                place = (
-                    place + torch.rand(place.shape, generator=generator, device=place.device) - 0.5
-                )
-            cell = place.to(torch.int32).clamp_(0, sizes[axis] - 1)
-            row += cell * stride
-            stride *= sizes[axis]
-        ones = torch.ones_like(x[0])[:, None]
+        place = x.reshape(3, -1) * torch.tensor([[float(n)] for n in sizes], device=x.device)
+        if generator is not None:
+            # Half a cell of noise: on average the nearest cell is the trilinear mixture.
+            place += torch.rand(place.shape, generator=generator, device=place.device) - 0.5
+        limit = torch.tensor([[n - 1.0] for n in sizes], device=place.device)
+        cell = torch.minimum(place.clamp_(min=0.0), limit).to(torch.int32)
+        row = cell[0] + sizes[0] * (cell[1] + sizes[1] * cell[2])
+        ones = torch.ones_like(place[0])[:, None]
         raw = gather(self.proposal, row[:, None], ones, "proposal", sink)
         sigma = torch.exp(raw.view(count, bins).clamp_max(MAX_LOG_DENSITY))
         return render_weights(sigma, delta, opaque_last=True)

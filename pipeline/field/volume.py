@@ -22,10 +22,12 @@ def render_weights(sigma: Tensor, delta: Tensor, *, opaque_last: bool = False) -
     Shapes as in :func:`transmittance`. With ``opaque_last`` the last interval stops what is left
     of the ray: the background, so that the weights sum to one.
     """
-    alpha = -torch.expm1(-sigma * delta)
+    # T_i alpha_i = T_i - T_{i+1}: what enters an interval and does not leave it.
+    left = torch.exp(-torch.cumsum(sigma * delta, dim=-1))
+    enters = torch.cat([torch.ones_like(left[..., :1]), left[..., :-1]], dim=-1)
     if opaque_last:
-        alpha = torch.cat([alpha[..., :-1], torch.ones_like(alpha[..., -1:])], dim=-1)
-    return transmittance(sigma, delta) * alpha
+        left = torch.cat([left[..., :-1], torch.zeros_like(left[..., :1])], dim=-1)
+    return enters - left
 
 
 def composite(weights: Tensor, values: Tensor) -> Tensor:

@@ -58,13 +58,15 @@ class Space:
 
     def warp(self, points: Tensor) -> Tensor:
         """Coordinates in [0, 1] of world points, both ``(3, ...)``; clamped at the bounds."""
-        matrix = torch.tensor(self.ref_from_world, dtype=points.dtype, device=points.device)
-        ref = (matrix[:, :3] @ points.reshape(3, -1) + matrix[:, 3:]).view(points.shape)
+        flat = points.reshape(3, -1)
+        matrix = torch.tensor(self.ref_from_world, dtype=flat.dtype, device=flat.device)
+        ref = torch.addmm(matrix[:, 3:], matrix[:, :3], flat)
         mapped = ndc(ref, self.near) if self.kind == "ndc" else contract(ref)
-        shape = (3,) + (1,) * (points.dim() - 1)
-        low = torch.tensor(self.low, dtype=points.dtype, device=points.device).view(shape)
-        high = torch.tensor(self.high, dtype=points.dtype, device=points.device).view(shape)
-        return ((mapped - low) / (high - low)).clamp(0.0, 1.0)
+        scale = [[1.0 / (b - a)] for a, b in zip(self.low, self.high, strict=True)]
+        shift = [[-a / (b - a)] for a, b in zip(self.low, self.high, strict=True)]
+        factor = torch.tensor(scale, dtype=flat.dtype, device=flat.device)
+        offset = torch.tensor(shift, dtype=flat.dtype, device=flat.device)
+        return torch.addcmul(offset, mapped, factor).clamp_(0.0, 1.0).view(points.shape)
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists that :meth:`from_json` takes back."""
