@@ -95,14 +95,13 @@ def _settings(params: Params) -> Settings:
 
 def _summary(found: Reconstructed, records: list[ImageRecord]) -> dict[str, Any]:
     """What poses.json holds: who was placed, who was not and why, and what was tried."""
-    matching = found.matching
     return {
         "total": len(records),
         "registered": sorted(found.views),
         "lost": [vars(image) for image in found.lost],
         "images": {
-            name: {"keypoints": count, "best_match": matching.best_match[name]}
-            for name, count in matching.keypoints.items()
+            name: {"keypoints": count, "best_match": found.matching.best_match[name]}
+            for name, count in found.matching.keypoints.items()
         },
         "reprojection_px": round(found.reprojection_px, 6),
         "points": len(found.points_xyz),
