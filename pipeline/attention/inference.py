@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -69,7 +70,7 @@ def _spans(length: int, tile: int) -> Iterator[tuple[int, int]]:
     """Cuts [0, length) into the fewest spans of at most `tile`, as equal as they can be."""
     count = math.ceil(length / tile)
     edges = [round(length * k / count) for k in range(count + 1)]
-    return zip(edges[:-1], edges[1:], strict=True)
+    return pairwise(edges)
 
 
 def _last_map(network: AttentiveRecurrentNet, bgr: Tensor, steps: int) -> np.ndarray:

@@ -72,15 +72,19 @@ class AttentiveRecurrentNet(nn.Module):
     def features(self, stacked: Tensor) -> Tensor:
         """Features (N,32,H,W) of photo and map, (N,4,H,W): five residual blocks."""
         x = self.det_conv0(stacked)
-        for block in (
+        for block in self.residual_blocks():
+            x = F.relu(block(x) + x)
+        return x
+
+    def residual_blocks(self) -> tuple[nn.Sequential, ...]:
+        """The five residual blocks, in their order."""
+        return (
             self.det_conv1,
             self.det_conv2,
             self.det_conv3,
             self.det_conv4,
             self.det_conv5,
-        ):
-            x = F.relu(block(x) + x)
-        return x
+        )
 
     def recur(self, features: Tensor, state: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
         """The next (hidden, cell) state, each (N,32,H,W); state None means both are 0.
@@ -88,20 +92,43 @@ class AttentiveRecurrentNet(nn.Module):
         At the first step the hidden half of the gates meets zeros and the forget gate
         multiplies zero, so neither is computed: the same result for half the work.
         """
-        gates = (self.conv_i[0], self.conv_g[0], self.conv_o[0])
+        gates = [first_layer(gate) for gate in (self.conv_i, self.conv_g, self.conv_o)]
         if state is None:
             joint = torch.cat([gate.weight[:, :FEATURES] for gate in gates])
-            bias = torch.cat([gate.bias for gate in gates])
+            bias = torch.cat([bias_of(gate) for gate in gates])
             i, g, o = F.conv2d(features, joint, bias, padding=1).chunk(3, 1)
             cell = torch.sigmoid(i) * torch.tanh(g)
         else:
-            gates = (*gates, self.conv_f[0])
+            gates = [*gates, first_layer(self.conv_f)]
             joint = torch.cat([gate.weight for gate in gates])
-            bias = torch.cat([gate.bias for gate in gates])
+            bias = torch.cat([bias_of(gate) for gate in gates])
             stacked = torch.cat([features, state[0]], 1)
             i, g, o, f = F.conv2d(stacked, joint, bias, padding=1).chunk(4, 1)
             cell = torch.sigmoid(f) * state[1] + torch.sigmoid(i) * torch.tanh(g)
         return torch.sigmoid(o) * torch.tanh(cell), cell
+
+
+def first_layer(block: nn.Sequential) -> nn.Conv2d:
+    """The convolution at the start of a block."""
+    layer = block[0]
+    if not isinstance(layer, nn.Conv2d):
+        raise TypeError(f"a block starts with a convolution, not {type(layer).__name__}")
+    return layer
+
+
+def last_layer(block: nn.Sequential) -> nn.Conv2d:
+    """The second convolution of a residual block."""
+    layer = block[2]
+    if not isinstance(layer, nn.Conv2d):
+        raise TypeError(f"a residual block has a second convolution, not {type(layer).__name__}")
+    return layer
+
+
+def bias_of(layer: nn.Conv2d) -> Tensor:
+    """The bias of a convolution, which all of this network's have."""
+    if layer.bias is None:
+        raise TypeError("this convolution has no bias")
+    return layer.bias
 
 
 def bgr_from_rgb(image: np.ndarray) -> Tensor:

@@ -23,7 +23,8 @@ class Pool:
     """Rainy pictures, the same without drops, and how much of each pixel is water.
 
     rainy, clean: sequences of (H,W,3) uint8 RGB; coverage: of (H,W) uint8, 255 = all water.
-    share: how often crops are drawn from this pool, relative to the others.
+    clean may be empty: then the pool gives no dry crops. share: how often crops are drawn from
+    this pool, relative to the others.
     """
 
     rainy: Sequence[np.ndarray]
@@ -75,7 +76,7 @@ def _draw(
     pool: Pool, rng: np.random.Generator, crop: int, clean_share: float
 ) -> tuple[np.ndarray, np.ndarray]:
     index = int(rng.integers(len(pool.rainy)))
-    dry = rng.random() < clean_share
+    dry = len(pool.clean) > 0 and rng.random() < clean_share
     source = (pool.clean if dry else pool.rainy)[index]
     cover = pool.coverage[index]
     size = min(_window(rng, crop), *cover.shape)

@@ -12,11 +12,17 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.attention.muon import Muon
-from pipeline.attention.network import FEATURES, AttentiveRecurrentNet
+from pipeline.attention.network import (
+    FEATURES,
+    AttentiveRecurrentNet,
+    bias_of,
+    first_layer,
+    last_layer,
+)
 from pipeline.attention.samples import MAP_THRESHOLD, VISIBLE_COVERAGE, Pool, draw_batch, wetness
 
 THETA = 0.8
-EMA_DECAY = 0.998
+EMA_DECAY = 0.995
 
 
 @dataclass(frozen=True)
@@ -59,23 +65,29 @@ def initialise(network: AttentiveRecurrentNet, seed: int) -> None:
 
     The first layer reads differences (each of its kernels sums to zero over the photo) four
     times as strongly as usual, because drops show in contrast, not in brightness. The gates
-    start open. From plain starting values nothing was learnt in the same time.
+    start open and, like the residual branches, quiet, so that nothing is saturated. From plain
+    starting values nothing was learnt in the same time.
     """
     generator = torch.Generator().manual_seed(seed)
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            deviation = math.sqrt(2 / module.weight[0].numel())
-            module.weight.data.normal_(0, deviation, generator=generator)
-            nn.init.zeros_(_bias(module))
     with torch.no_grad():
-        first = network.det_conv0[0].weight
+        for module in network.modules():
+            if isinstance(module, nn.Conv2d):
+                deviation = math.sqrt(2 / module.weight[0].numel())
+                module.weight.normal_(0, deviation, generator=generator)
+                bias_of(module).zero_()
+        first = first_layer(network.det_conv0).weight
         first[:, :3] -= first[:, :3].mean((2, 3), keepdim=True)
         first[:, :3] *= 4
         first[:, 3:] *= 0.1
-        _bias(network.conv_i[0]).fill_(1)
-        _bias(network.conv_o[0]).fill_(1)
-        network.det_conv_mask[0].weight *= 0.3
-        _bias(network.det_conv_mask[0]).fill_(0.2)
+        for block in network.residual_blocks():
+            last_layer(block).weight *= 0.3
+        for gate in (network.conv_i, network.conv_f, network.conv_g, network.conv_o):
+            first_layer(gate).weight *= 0.5
+        bias_of(first_layer(network.conv_i)).fill_(1)
+        bias_of(first_layer(network.conv_o)).fill_(1)
+        last = first_layer(network.det_conv_mask)
+        last.weight *= 0.3
+        bias_of(last).fill_(0.2)
 
 
 def unroll(network: AttentiveRecurrentNet) -> None:
@@ -86,20 +98,15 @@ def unroll(network: AttentiveRecurrentNet) -> None:
     gate is nearly closed: every further step then repeats the first one (but for what the
     closed gate lets through), and training goes on from there instead of unlearning.
     """
+    gates = (network.conv_i, network.conv_f, network.conv_g, network.conv_o)
     with torch.no_grad():
-        first = network.det_conv0[0]
-        _bias(first).add_(0.5 * first.weight[:, 3].sum((1, 2)))
+        first, forget = first_layer(network.det_conv0), first_layer(network.conv_f)
+        bias_of(first).add_(0.5 * first.weight[:, 3].sum((1, 2)))
         first.weight[:, 3].zero_()
-        for gate in (network.conv_i, network.conv_f, network.conv_g, network.conv_o):
-            gate[0].weight[:, FEATURES:].zero_()
-        network.conv_f[0].weight.mul_(0.1)
-        _bias(network.conv_f[0]).fill_(-3)
-
-
-def _bias(layer: nn.Module) -> Tensor:
-    bias = layer.bias
-    assert isinstance(bias, Tensor)  # every convolution of this network has one
-    return bias.data
+        for gate in gates:
+            first_layer(gate).weight[:, FEATURES:].zero_()
+        forget.weight.mul_(0.1)
+        bias_of(forget).fill_(-3)
 
 
 class Trainer:
@@ -115,7 +122,7 @@ class Trainer:
     ) -> None:  # fmt: skip
         self.network, self.pools, self.phases = network, pools, phases
         self.seed, self.clean_share = seed, clean_share
-        self.phase = self.iteration = self.seen = 0
+        self.phase = self.iteration = self.seen = self.done = 0
         self.average = AttentiveRecurrentNet().to(next(network.parameters()).device)
         self._begin_phase()
 
@@ -155,7 +162,7 @@ class Trainer:
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self._apply(phase)
-        self.iteration += 1
+        self.iteration, self.done = self.iteration + 1, self.done + 1
         if self.iteration >= phase.iterations:
             self.phase, self.iteration = self.phase + 1, 0
             self._begin_phase()
@@ -172,18 +179,16 @@ class Trainer:
         self.seen += 1
         decay = min(EMA_DECAY, self.seen / (self.seen + 10))
         with torch.no_grad():
-            for kept, new in zip(
-                self.average.parameters(), self.network.parameters(), strict=True
-            ):
+            for kept, new in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 kept.lerp_(new, 1 - decay)
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs to go on as if nothing had happened; plain tensors and numbers."""
+        """All that `restore` needs to go on from here: tensors and numbers."""
         return {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
-            "where": [self.phase, self.iteration, self.seen],
+            "where": [self.phase, self.iteration, self.seen, self.done],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -192,7 +197,7 @@ class Trainer:
         self.average.load_state_dict(state["average"])
         for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(saved)
-        self.phase, self.iteration, self.seen = state["where"]
+        self.phase, self.iteration, self.seen, self.done = state["where"]
 
 
 def _is_matrix(name: str, parameter: Tensor) -> bool:
@@ -210,7 +215,8 @@ def score(network: AttentiveRecurrentNet, pool: Pool, steps: int) -> Score:
     for rainy, cover in zip(pool.rainy, pool.coverage, strict=True):
         bgr = np.ascontiguousarray(rainy[..., ::-1].transpose(2, 0, 1), np.float32) / 255
         with torch.inference_mode():
-            found = network(torch.from_numpy(bgr)[None].to(device), steps)[-1][0, 0].cpu().clamp(0, 1)
+            raw = network(torch.from_numpy(bgr)[None].to(device), steps)[-1][0, 0]
+        found = raw.cpu().clamp(0, 1)
         coverage = torch.from_numpy(cover.astype(np.float32) / 255)
         squares += float((found - wetness(coverage)).square().sum())
         pixels += cover.size
@@ -235,15 +241,15 @@ def fit(
 ) -> AttentiveRecurrentNet:
     """The running average of the weights after all phases.
 
-    on_score(phase, iteration, mean loss since the last call, score) is called every
-    `validate_every` iterations and at the end of each phase: the place to write a checkpoint.
+    on_score(iterations done, recurrent steps, mean loss since the last call, score) is called
+    every `validate_every` iterations and at the end of each phase: there a checkpoint is written.
     """
     losses: list[float] = []
     while not trainer.finished:
         steps = trainer.phases[trainer.phase].steps
         losses.append(trainer.advance())
-        if trainer.iteration % validate_every == 0:
+        if trainer.iteration % validate_every == 0:  # 0 after the last one of a phase, too
             result = score(trainer.average, validation, steps)
-            on_score(trainer.phase, trainer.iteration, float(np.mean(losses)), result)
+            on_score(trainer.done, steps, float(np.mean(losses)), result)
             losses = []
     return trainer.average

@@ -1,0 +1,164 @@
+"""Losses, optimiser and a short fit; the shipped weights find a drop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pipeline.attention.inference import attend
+from pipeline.attention.muon import orthogonalised
+from pipeline.attention.network import AttentiveRecurrentNet, load_network
+from pipeline.attention.pools import read_photo_pairs, read_rendered
+from pipeline.attention.samples import Pool, coverage_of_pair, draw_batch, wetness
+from pipeline.attention.training import Phase, Trainer, attention_loss, initialise, score
+from pipeline.errors import UserError
+from pipeline.io.images import write_image
+
+SHIPPED = Path(__file__).parents[2] / "weights" / "detector.safetensors"
+
+
+def _pool(count: int = 6, size: int = 64) -> Pool:
+    """Discs that show the picture upside down and blurred: a caricature of drops."""
+    rng = np.random.default_rng(11)
+    rainy, clean, coverage = [], [], []
+    for _ in range(count):
+        coarse = rng.random((8, 8, 3)).astype(np.float32)
+        picture = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_NEAREST)
+        alpha = np.zeros((size, size), np.float32)
+        for _ in range(4):
+            place = tuple(int(v) for v in rng.integers(0, size, 2))
+            cv2.circle(alpha, place, int(rng.integers(5, 11)), 1.0, -1)
+        alpha = cv2.GaussianBlur(alpha, (0, 0), 1.0)
+        inside = cv2.GaussianBlur(picture[::-1], (0, 0), 4)
+        wet = picture * (1 - alpha[..., None]) + inside * alpha[..., None]
+        for kept, values in ((rainy, wet), (clean, picture), (coverage, alpha)):
+            kept.append(np.rint(values * 255).astype(np.uint8))
+    return Pool(rainy, clean, coverage)
+
+
+def test_attention_loss_by_hand() -> None:
+    target = torch.zeros(1, 1, 2, 2)
+    maps = [torch.full_like(target, value) for value in (1.0, 2.0, 3.0, 4.0)]
+    # 0.8^3 * 1 + 0.8^2 * 4 + 0.8 * 9 + 16
+    assert attention_loss(maps, target).item() == pytest.approx(0.512 + 2.56 + 7.2 + 16)
+    assert attention_loss(maps[:1], target).item() == pytest.approx(1.0)
+
+
+def test_wetness_puts_visible_water_at_the_threshold() -> None:
+    coverage = torch.tensor([0.0, 0.05, 0.1, 1 / 6, 0.5, 1.0])
+    assert torch.allclose(wetness(coverage), torch.tensor([0.0, 0.3, 0.6, 1.0, 1.0, 1.0]))
+
+
+def test_coverage_of_a_photo_pair_is_where_it_differs() -> None:
+    clean = np.full((20, 20, 3), 100, np.uint8)
+    rainy = clean.copy()
+    rainy[5:12, 5:12, 1] += 60
+    rainy[15, 15] += 25  # noise
+    found = coverage_of_pair(rainy, clean)
+    assert found[6:11, 6:11].min() == 255 and found[:, 14:].max() == 0 and found[:4].max() == 0
+    with pytest.raises(ValueError):
+        coverage_of_pair(rainy, clean[:10])
+
+
+def test_muon_makes_singular_values_alike() -> None:
+    matrix = torch.randn(16, 40, generator=torch.Generator().manual_seed(0))
+    before, after = (torch.linalg.svdvals(m) for m in (matrix, orthogonalised(matrix)))
+    assert before.max() / before.min() > 3
+    assert after.min() > 0.6 and after.max() < 1.3
+    assert torch.allclose(orthogonalised(matrix.T), orthogonalised(matrix).T, atol=1e-5)
+
+
+def test_batches_are_bgr_in_range_and_repeatable() -> None:
+    pool = _pool()
+    first, second = (
+        draw_batch([pool], np.random.default_rng(4), 5, 32, clean_share=0.2) for _ in range(2)
+    )
+    assert first[0].shape == (5, 3, 32, 32) and first[1].shape == (5, 1, 32, 32)
+    assert all(t.min() >= 0 and t.max() <= 1 for t in first)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    dry, cover = draw_batch([pool], np.random.default_rng(4), 5, 32, clean_share=1.0)
+    assert cover.max() == 0 and dry.std() > 0.05
+
+
+def _train(iterations: list[int], resume_at: int | None = None) -> tuple[list[float], Trainer]:
+    def fresh() -> Trainer:
+        network = AttentiveRecurrentNet()
+        initialise(network, 0)
+        phases = [Phase(k + 1, n, 2, 32, 0.02) for k, n in enumerate(iterations)]
+        return Trainer(network, [_pool()], phases, seed=1, clean_share=0.1)
+
+    trainer, losses = fresh(), []
+    while not trainer.finished:
+        losses.append(trainer.advance())
+        if trainer.done == resume_at:
+            state, trainer = trainer.state(), fresh()
+            trainer.restore(state)
+    return losses, trainer
+
+
+def test_twenty_steps_learn() -> None:
+    losses, _ = _train([20])
+    assert len(losses) == 20
+    assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:4])
+
+
+def test_an_interrupted_fit_ends_like_one_that_was_not() -> None:
+    (whole, one), (parts, two) = _train([4, 3]), _train([4, 3], resume_at=3)
+    assert whole == parts
+    for a, b in zip(one.average.parameters(), two.average.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_score_of_a_network_that_marks_everything() -> None:
+    network = AttentiveRecurrentNet().eval()
+    with torch.no_grad():
+        network.det_conv_mask[0].weight.zero_()
+        network.det_conv_mask[0].bias.fill_(0.9)
+    pool = _pool(2)
+    wet = np.mean([cover / 255 > 0.05 for cover in pool.coverage])
+    result = score(network, pool, 1)
+    assert result.recall == 1 and result.precision == pytest.approx(wet, abs=1e-6)
+    assert result.f1 == pytest.approx(2 * wet / (1 + wet), abs=1e-6)
+
+
+def test_folders_of_pairs(tmp_path: Path) -> None:
+    pool = _pool(2, 32)
+    for k, (wet, dry, cover) in enumerate(zip(pool.rainy, pool.clean, pool.coverage, strict=True)):
+        write_image(tmp_path / "data" / f"{k}_rain.png", wet)
+        write_image(tmp_path / "gt" / f"{k}_clean.png", dry)
+        for kind, picture in (("rainy", wet), ("clean", dry)):
+            write_image(tmp_path / kind / f"{k}.png", picture)
+        write_image(tmp_path / "coverage" / f"{k}.png", np.repeat(cover[..., None], 3, axis=2))
+    rendered = read_rendered(tmp_path)
+    assert all(np.array_equal(a, b) for a, b in zip(rendered[2], pool.coverage, strict=True))
+    assert np.array_equal(rendered[0][1], pool.rainy[1])
+    photos = read_photo_pairs(tmp_path)
+    assert np.array_equal(photos[1][0], pool.clean[0]) and photos[2][0].max() == 255
+    (tmp_path / "gt" / "1_clean.png").unlink()
+    with pytest.raises(UserError, match="1_clean"):
+        read_photo_pairs(tmp_path)
+    with pytest.raises(UserError, match="no images"):
+        read_rendered(tmp_path / "empty")
+
+
+def test_shipped_weights_find_a_painted_drop() -> None:
+    from pipeline.drops.painter import paint
+    from pipeline.drops.shape import Drop
+
+    y = np.mgrid[:96, :96][0].astype(np.float32)
+    rng = np.random.default_rng(2)
+    leaves = cv2.resize(rng.random((24, 24, 3)).astype(np.float32), (96, 96))
+    picture = np.clip(0.5 * leaves + 0.5 * (1 - y / 96)[..., None], 0, 1).astype(np.float32)
+    drop = Drop(center=(6.0, -4.0), radius=13.0, contact_angle=1.1)
+    wet, coverage = paint(picture, [drop], focal_px=120, pane_distance=120, aperture_radius=1.0)
+    network = load_network(SHIPPED)
+    found = attend(network, wet)
+    core, away = coverage > 0.5, coverage == 0
+    assert core.sum() > 300
+    assert found[core].mean() > 0.4
+    assert found[away].mean() < 0.5 * found[core].mean()
+    assert attend(network, picture)[core].mean() < 0.6 * found[core].mean()
