@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 
 Curve = Sequence[tuple[float, float]]
 
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 14, 12, 30
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 14, 28, 30
 _MOST_POINTS = 300
 
 
@@ -30,12 +30,10 @@ def curves(
     low, high = min(ys), max(ys)
     pad = 0.06 * (high - low) or 0.5
     frame = _Frame(min(xs), max(xs) or 1, low - pad, high + pad, size)
-    parts = [_axes(frame, log, unit)]
-    for index, (label, curve) in enumerate(drawn.items()):
+    parts = [_axes(frame, log, unit), _legend(list(drawn))]
+    for index, curve in enumerate(drawn.values()):
         path = " ".join(f"{frame.x(x):.1f},{frame.y(y):.1f}" for x, y in curve)
         parts.append(f'<polyline class="curve s{index}" points="{path}"/>')
-        if len(drawn) > 1:
-            parts.append(_legend(index, label, size))
     return _svg(parts, size, title)
 
 
@@ -49,6 +47,7 @@ def bars(
         return Markup("")
     frame = _Frame(0, len(names), 0, max(known) * 1.08 or 1, size)
     parts, slot = [_axes(frame, False, unit, numbered=False)], 0.8 / len(series)
+    parts.append(_legend(list(series)))
     for index, (label, values) in enumerate(series.items()):
         for place, name in enumerate(names):
             value = values.get(name, math.nan)
@@ -61,8 +60,6 @@ def bars(
                 f' width="{max(right - left - 1, 1):.1f}" height="{max(bottom - top, 0):.1f}">'
                 f"<title>{escape(name)}, {escape(label)}: {value:.3g} {escape(unit)}</title></rect>"
             )
-        if len(series) > 1:
-            parts.append(_legend(index, label, size))
     if len(names) * 60 <= size[0]:
         parts += [
             f'<text class="tick" text-anchor="middle" x="{frame.x(place + 0.5):.1f}"'
@@ -144,9 +141,9 @@ def _usable(curve: Curve, log: bool) -> list[tuple[float, float]]:
 def _axes(frame: _Frame, log: bool, unit: str, numbered: bool = True) -> str:
     width, height = frame.size
     parts = []
-    for value in _round_steps(frame.low, frame.high):
+    for value in (_decades if log else _round_steps)(frame.low, frame.high):
         y = frame.y(value)
-        label = f"{10**value:.2g}" if log else f"{value:g}"
+        label = f"{10**value:.4g}" if log else f"{value:g}"
         parts.append(
             f'<line class="grid" x1="{_LEFT}" x2="{width - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
         )
@@ -160,7 +157,8 @@ def _axes(frame: _Frame, log: bool, unit: str, numbered: bool = True) -> str:
                 f' y="{height - 10}">{value:g}</text>'
             )
     if unit:
-        parts.append(f'<text class="tick" x="{_LEFT + 4}" y="{_TOP + 2}">{escape(unit)}</text>')
+        label = f'<text class="tick" text-anchor="end" x="{_LEFT - 6}" y="12">{escape(unit)}</text>'
+        parts.append(label)
     return "".join(parts)
 
 
@@ -173,9 +171,22 @@ def _round_steps(low: float, high: float, wanted: int = 5) -> list[float]:
     return [round(i * step, 10) for i in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def _legend(index: int, label: str, size: tuple[int, int]) -> str:
-    x, y = size[0] - _RIGHT, _TOP + 4 + 15 * index
-    return f'<text class="legend s{index}" text-anchor="end" x="{x}" y="{y}">{escape(label)}</text>'
+def _decades(low: float, high: float) -> list[float]:
+    """Logarithms within [low, high] of 1, 2 and 5 times powers of ten; many: of the powers."""
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    some = (1,) if high - low > 3 else (1, 2, 5)
+    logs = [power + math.log10(factor) for power in powers for factor in some]
+    return [value for value in logs if low <= value <= high]
+
+
+def _legend(labels: Sequence[str]) -> str:
+    if len(labels) < 2:
+        return ""
+    spans = [
+        f'<tspan class="s{i}" dx="{14 * (i > 0)}">{escape(text)}</tspan>'
+        for i, text in enumerate(labels)
+    ]
+    return f'<text class="legend" x="{_LEFT + 4}" y="12">{"".join(spans)}</text>'
 
 
 def _short(name: str) -> str:

@@ -15,7 +15,7 @@ ROWS: tuple[tuple[str, str, str, str, bool | None], ...] = (
     ("Held-out views", "PSNR beside the drops, dB", "kept.psnr", ".2f", True),
     (
         "Held-out views",
-        "PSNR to the photos beside the drops, dB",
+        "PSNR to the photo beside them, dB",
         "selfcheck.kept_psnr",
         ".2f",
         True,
@@ -120,7 +120,7 @@ def headline(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> str
         text = "Without clean references the views cannot be judged under the drops"
         text += f"; beside them they match the photos to {kept:.1f} dB" if kept is not None else ""
         return f"{text}. {poses}"
-    text = f"Views held out of the fit come within {test:.1f} dB (SSIM {ssim:.3f}) of the dry scene"
+    text = f"Views held out of the fit reach {test:.1f} dB (SSIM {ssim:.3f}) against the dry scene"
     theirs = value(other, "test.psnr") if other else None
     if theirs is not None:
         word = "better" if test >= theirs else "worse"

@@ -17,7 +17,7 @@ LAYERS = {
     "attention": "Attention",
     "mask": "Mask",
     "clean": "Clean view",
-    "composite": "Cleaned photo",
+    "composite": "Cleaned",
     "depth": "Depth",
 }
 

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+
+from pipeline.report.charts import bars, camera_map, curves
+
+SIZE = (400, 200)
+
+
+def test_a_curve_goes_from_its_first_to_its_last_point():
+    drawing = curves({"a": [(0, 1.0), (10, 3.0)]}, title="x", unit="dB", size=SIZE)
+    ET.fromstring(drawing)
+    points = re.search(r'points="([^"]+)"', drawing).group(1).split()
+    (x0, y0), (x1, y1) = (tuple(map(float, point.split(","))) for point in points)
+    assert x0 == 46 and x1 == 386
+    assert y0 > y1, "larger values are higher up"
+
+
+def test_points_that_cannot_be_drawn_are_left_out():
+    curve = [(0, 1.0), (1, math.nan), (2, math.inf), (3, 0.0), (4, 0.1)]
+    drawing = curves({"a": curve}, title="x", unit="", log=True, size=SIZE)
+    assert len(re.search(r'points="([^"]+)"', drawing).group(1).split()) == 2
+    assert ">0.1<" not in drawing or "nan" not in drawing
+    assert "nan" not in drawing and "inf" not in drawing
+    assert curves({"a": [(0, math.nan)]}, title="x", unit="", size=SIZE) == ""
+
+
+def test_long_curves_are_thinned_and_keep_their_end():
+    drawing = curves({"a": [(i, float(i)) for i in range(5000)]}, title="x", unit="", size=SIZE)
+    points = re.search(r'points="([^"]+)"', drawing).group(1).split()
+    assert len(points) <= 301
+    assert points[-1].startswith("386.0,")
+
+
+def test_bars_grow_with_their_values_and_names_are_escaped():
+    values = {"a<b>.png": 10.0, "c.png": 20.0, "d.png": math.inf}
+    drawing = bars({"one": values}, title="x", unit="dB", size=SIZE)
+    ET.fromstring(drawing)
+    heights = [float(h) for h in re.findall(r'<rect[^>]*height="([\d.]+)"', drawing)]
+    assert len(heights) == 2 and math.isclose(heights[1], 2 * heights[0], abs_tol=0.11)
+    assert "a&lt;b&gt;.png" in drawing and "<b>" not in drawing
+    assert bars({"one": {}}, title="x", unit="", size=SIZE) == ""
+
+
+def test_cameras_stand_as_seen_from_above():
+    """Two cameras side by side looking ahead: left is left, and they look up the page."""
+    left, right = np.eye(4), np.eye(4)
+    left[0, 3], right[0, 3] = 1.0, -1.0  # cam_from_world: centres at x = -1 and x = +1
+    drawing = camera_map({"left": left, "right": right}, {"right"}, size=SIZE)
+    ET.fromstring(drawing)
+    found = re.findall(
+        r'class="camera (s\d)"><polygon points="([\d.]+),([\d.]+) ([\d.]+),([\d.]+) [^"]*"/>'
+        r"<circle[^>]*/><title>(\w+)",
+        drawing,
+    )
+    places = {name: (kind, float(x), float(y), float(tip)) for kind, x, y, _, tip, name in found}
+    assert places["left"][1] < places["right"][1]
+    assert places["left"][3] < places["left"][2], "ahead is up the page"
+    assert (places["left"][0], places["right"][0]) == ("s0", "s1")
+    assert camera_map({}, set(), size=SIZE) == ""

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+from pipeline.report.numbers import headline, missing, table, tiles
+
+OWN = {
+    "test": {"psnr": 28.5, "ssim": 0.91, "lpips": None, "lpips_reason": "no weights"},
+    "composite": {"psnr": 31.0},
+    "input": {"psnr": 18.0},
+    "masks": {"iou": 0.8, "coverage": 0.12},
+    "poses": {"registered": 23, "total": 24},
+    "conventions": {"data_range": 1.0},
+}
+OTHER = {"test": {"psnr": 22.0, "ssim": 0.95, "lpips": 0.2}}
+
+
+def test_the_table_says_who_is_ahead():
+    lines = {(line.group, line.label): line for line in table(OWN, OTHER)}
+    psnr = lines["Held-out views", "PSNR, dB"]
+    assert (psnr.own, psnr.other, psnr.gain, psnr.ahead) == ("28.50", "22.00", "+6.50", True)
+    ssim = lines["Held-out views", "SSIM"]
+    assert ssim.gain == "-0.0400" and ssim.ahead is False
+    lpips = lines["Held-out views", "LPIPS"]
+    assert (lpips.own, lpips.other, lpips.gain) == ("–", "0.2000", "")
+    assert lpips.reason == "no weights"
+
+
+def test_what_is_missing_is_listed_by_reason():
+    assert missing(OWN) == [("no weights", "test.lpips")]
+
+
+def test_headline_and_tiles_tell_gain_and_loss_alike():
+    assert "28.5 dB (SSIM 0.910)" in headline(OWN, OTHER)
+    assert "6.5 dB better" in headline(OWN, OTHER)
+    assert "6.5 dB worse" in headline({**OTHER, "poses": OWN["poses"]}, OWN)
+    assert ("+6.5", "dB", "over the same field fitted without masks") in tiles(OWN, OTHER)
+    assert "over" not in str(tiles(OWN, None)) and "23/24" in str(tiles(OWN, None))
+
+
+def test_without_references_nothing_is_claimed():
+    blind = {
+        "test": {"psnr": None, "psnr_reason": "none", "ssim": None, "ssim_reason": "none"},
+        "selfcheck": {"kept_psnr": 27.3},
+        "poses": {"registered": 3, "total": 3},
+    }
+    sentence = headline(blind, {})
+    assert "cannot be judged under the drops" in sentence and "27.3 dB" in sentence
+    assert all("clean references" not in text for _, _, text in tiles(blind, {}))
