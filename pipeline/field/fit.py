@@ -101,10 +101,11 @@ def fit(
     """
     steppers = _steppers(model, steps)
     record = Record()
+    running: list[Tensor] = []
     first = 0
     if resume is not None:
         first = _restore(model, steppers, record, resume)
-    running: list[Tensor] = []
+        running = list(resume[1]["running"])
     with _pool(threads, buffer.device) as pool:
         for step in range(first, steps):
             rays, observed = buffer.batch(step, batch_rays)
@@ -252,6 +253,8 @@ def _state(
     for stepper in steppers:
         state |= stepper.state()
     state["record"] = torch.tensor(record.rows, dtype=torch.float64).reshape(-1, 3)
+    # Losses since the last row: the row that they go into must not depend on a restart.
+    state["running"] = torch.stack(running) if running else torch.zeros(0, 2)
     return state
 
 

@@ -1,0 +1,130 @@
+"""The fit learns, repeats to the byte, survives a kill and says when it breaks down."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.errors import UserError
+from pipeline.field.buffer import PosedPhoto, RayBuffer
+from pipeline.field.fit import fit
+from pipeline.field.grid_field import GridConfig, GridField
+from pipeline.field.model import describe, restore, scene_space
+from pipeline.field.render import render_view
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scene import camera, photograph
+
+SIZE, FOCAL, NEAR, FAR = (40, 30), 38.0, 2.5, 20.0
+INTRINSICS = (FOCAL, FOCAL, 20.0, 15.0, 0.0)
+SMALL = GridConfig(
+    levels=2, features=4, table_log2=12, coarse=(12, 10, 8), fine=(48, 36, 16), hidden=16,
+    samples=6, bins=16, proposal=(24, 18, 16),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[PosedPhoto]:
+    out = []
+    for i in range(6):
+        pose = camera(i, 6)
+        image, _ = photograph(pose, *SIZE, FOCAL)
+        keep = np.ones((30, 40), bool)
+        keep[5:9, 5:9] = False
+        out.append(PosedPhoto(f"{i}", image, keep, pose, INTRINSICS, NEAR, FAR))
+    return out
+
+
+def field(photos: list[PosedPhoto], seed: int = 0) -> GridField:
+    cams = np.stack([p.cam_from_world for p in photos])
+    count = len(photos)
+    space = scene_space(
+        "auto", cams, np.tile(INTRINSICS, (count, 1)), np.tile(SIZE, (count, 1)), NEAR, FAR
+    )
+    return GridField(SMALL, space, seed)
+
+
+def same(a: torch.nn.Module, b: torch.nn.Module) -> bool:
+    pairs = zip(a.parameters(), b.parameters(), strict=True)
+    return all(torch.equal(x, y) for x, y in pairs)
+
+
+def test_covered_pixels_are_never_drawn(photos: list[PosedPhoto]) -> None:
+    marked = []
+    for p in photos:
+        image = np.zeros_like(p.image)
+        image[~p.keep_mask] = 1.0
+        marked.append(_with(p, image))
+    buffer = RayBuffer(marked, 0)
+    assert buffer.count == 6 * (1200 - 16)
+    drawn = [buffer.batch(step, 512)[1] for step in range(buffer.count // 512)]
+    assert float(torch.cat(drawn).max()) == 0.0
+
+
+def _with(photo: PosedPhoto, image: np.ndarray) -> PosedPhoto:
+    return PosedPhoto(**{**vars(photo), "image": image})
+
+
+def test_an_epoch_draws_every_kept_pixel_once(photos: list[PosedPhoto]) -> None:
+    buffer = RayBuffer(photos[:1], 0)
+    size = buffer.count // 8
+    rays = torch.cat([buffer.batch(step, size)[0].rays_d for step in range(8)], dim=1)
+    assert len(torch.unique(rays, dim=1).t()) == size * 8
+
+
+def test_everything_masked_is_said(photos: list[PosedPhoto]) -> None:
+    dark = PosedPhoto(**{**vars(photos[0]), "keep_mask": np.zeros((30, 40), bool)})
+    with pytest.raises(UserError, match="masked"):
+        RayBuffer([dark], 0)
+
+
+def test_the_fit_learns_and_a_view_renders_close_to_the_photo(photos: list[PosedPhoto]) -> None:
+    model = field(photos)
+    record = fit(model, RayBuffer(photos, 0), steps=100, batch_rays=512, seed=0)
+    assert record.rows[-1][0] == 100
+    spread = float(np.mean([p.image.reshape(-1, 3).var(0).mean() for p in photos]))
+    grey = -10 * np.log10(spread)  # what the mean colour of each photo reaches
+    assert record.rows[-1][2] > grey + 2.0
+    view = render_view(model, photos[1].cam_from_world, INTRINSICS, SIZE, NEAR, FAR)
+    error = float(((view.rgb - photos[1].image) ** 2).mean())
+    assert -10 * np.log10(error) > grey + 2.0
+    assert view.depth.min() >= NEAR * 0.999 and view.depth.max() <= FAR * 1.001
+    again = restore(describe(model), {k: v.numpy() for k, v in model.state_dict().items()})
+    twice = render_view(again, photos[1].cam_from_world, INTRINSICS, SIZE, NEAR, FAR)
+    assert np.array_equal(view.rgb, twice.rgb)
+
+
+def test_same_seed_same_bytes_for_one_thread_and_two(photos: list[PosedPhoto]) -> None:
+    models = [field(photos) for _ in range(3)]
+    for model, threads, seed in zip(models, (1, 2, 1), (7, 7, 8), strict=True):
+        fit(model, RayBuffer(photos, 0), steps=8, batch_rays=256, seed=seed, threads=threads)
+    assert same(models[0], models[1])
+    assert not same(models[0], models[2])
+
+
+def test_a_resumed_fit_ends_with_the_same_bytes(photos: list[PosedPhoto]) -> None:
+    saved: list[tuple[int, dict[str, torch.Tensor]]] = []
+
+    def save(step: int, state: dict[str, torch.Tensor]) -> None:
+        saved.append((step, {name: value.clone() for name, value in state.items()}))
+
+    how = {"steps": 12, "batch_rays": 256, "seed": 3, "log_every": 5}
+    whole, later = field(photos), field(photos, seed=99)
+    first = fit(whole, RayBuffer(photos, 0), save_every=7, save=save, **how)
+    second = fit(later, RayBuffer(photos, 0), resume=saved[0], **how)
+    assert saved[0][0] == 7
+    assert same(whole, later)
+    assert first.rows == second.rows
+
+
+def test_a_loss_that_is_not_finite_stops_with_step_and_knob(photos: list[PosedPhoto]) -> None:
+    model = field(photos)
+    with torch.no_grad():
+        model.colour_out.bias.fill_(float("nan"))
+    with pytest.raises(UserError, match="near step 4") as caught:
+        fit(model, RayBuffer(photos, 0), steps=20, batch_rays=256, seed=0, log_every=5)
+    assert "nerf." in caught.value.hint

@@ -1,0 +1,58 @@
+"""Rays and pixels are each other's inverse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pipeline.geometry.rays import pixel_rays, project, undistort
+
+
+def a_camera() -> torch.Tensor:
+    angle = 0.4
+    c, s = math.cos(angle), math.sin(angle)
+    rows = [[c, 0.0, s, 0.3], [0.0, 1.0, 0.0, -0.2], [-s, 0.0, c, 1.1]]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.12, 0.2])
+def test_a_point_on_a_pixels_ray_lands_on_that_pixel(k1: float) -> None:
+    camera = torch.tensor([320.0, 310.0, 201.0, 148.0, k1]).double()
+    columns = torch.tensor([0.0, 399.0, 0.0, 399.0, 123.0]).double()
+    rows = torch.tensor([0.0, 0.0, 299.0, 299.0, 45.0]).double()
+    rays_o, rays_d = pixel_rays(columns, rows, camera, a_camera())
+    t = torch.tensor([1.0, 2.0, 3.0, 40.0, 5.0]).double()
+    u, v, depth = project(rays_o + rays_d * t, camera, a_camera())
+    torch.testing.assert_close(u, columns, atol=1e-6, rtol=0)
+    torch.testing.assert_close(v, rows, atol=1e-6, rtol=0)
+    torch.testing.assert_close(depth, t)  # t is the depth along z
+
+
+def test_the_principal_point_looks_along_the_optical_axis() -> None:
+    # cx = 10.5 is the centre of column 10.
+    camera = torch.tensor([50.0, 50.0, 10.5, 7.5, 0.0])
+    pose = torch.eye(4)[:3]
+    rays_o, rays_d = pixel_rays(torch.tensor([10]), torch.tensor([7]), camera, pose)
+    assert rays_d[:, 0].tolist() == [0.0, 0.0, 1.0]
+    assert rays_o[:, 0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_every_ray_may_have_a_camera_of_its_own() -> None:
+    poses = torch.stack([a_camera(), torch.eye(4).double()[:3]])
+    cameras = torch.tensor([[300.0, 300, 200, 150, 0.1], [500.0, 500, 100, 90, 0.0]]).double()
+    columns, rows = torch.tensor([7, 9]), torch.tensor([3, 250])
+    together = pixel_rays(columns, rows, cameras, poses)
+    for i in range(2):
+        alone = pixel_rays(columns[i : i + 1], rows[i : i + 1], cameras[i], poses[i])
+        torch.testing.assert_close(together[0][:, i], alone[0][:, 0])
+        torch.testing.assert_close(together[1][:, i], alone[1][:, 0])
+
+
+def test_undistorting_undoes_the_distortion() -> None:
+    u, k1 = torch.linspace(-0.8, 0.8, 9).double(), torch.tensor(0.25).double()
+    gain = 1 + k1 * (u * u + 0.09)
+    x, y = undistort(u * gain, 0.3 * gain, k1)
+    torch.testing.assert_close(x, u, atol=1e-6, rtol=0)
+    torch.testing.assert_close(y, torch.full_like(u, 0.3), atol=1e-6, rtol=0)
