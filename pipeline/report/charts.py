@@ -91,8 +91,8 @@ def camera_map(
     plane = np.stack([np.cross(ahead, up), -ahead])  # right and, downwards in the drawing, back
     flat = {name: plane @ world[:3, 3] for name, world in worlds.items()}
     spread = np.stack(list(flat.values()))
-    extent = float(np.ptp(spread, axis=0).max()) or 1.0
-    scale = (min(size) - 70) / extent
+    extent = np.maximum(np.ptp(spread, axis=0), 1e-9)
+    scale = float(((np.array(size) - 80) / extent).min())
     middle = (spread.max(axis=0) + spread.min(axis=0)) / 2
     parts = []
     for name, world in worlds.items():
