@@ -65,10 +65,10 @@ def _on_threads(tasks: dict[str, Delayed], label: str, _: str, workers: int) -> 
     torch = sys.modules.get("torch")
     threads = torch.get_num_threads() if torch is not None else 0
     try:
-        with tqdm(total=len(tasks), desc=label, unit="image", leave=False) as bar:
-            with Callback(posttask=lambda *_: bar.update()):
-                how = {"scheduler": "threads", "num_workers": workers}
-                results = dask.compute(*tasks.values(), optimize_graph=False, **how)
+        bar = tqdm(total=len(tasks), desc=label, unit="image", leave=False)
+        with bar, Callback(posttask=lambda *_: bar.update()):
+            how = {"scheduler": "threads", "num_workers": workers}
+            results = dask.compute(*tasks.values(), optimize_graph=False, **how)
     finally:
         if torch is not None:
             torch.set_num_threads(threads)
@@ -80,7 +80,7 @@ def _on_cluster(tasks: dict[str, Delayed], label: str, address: str, _: int) -> 
     from distributed import Client, KilledWorker, as_completed
 
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise UserError(
             f"--scheduler {address}: no Dask scheduler answers there ({error}).",

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML, YAMLError
 from pipeline.errors import UserError
 
 STAGES = Path(__file__).resolve().parents[1] / "stages"
-OTHER_SECTIONS = ("scenes", "variants", "comparisons")
+OTHER_SECTIONS = ("scene_defaults", "scenes", "variants", "comparisons")
 
 
 class Section(pydantic.BaseModel):

@@ -15,7 +15,12 @@ from pipeline.io.maps import read_map
 from pipeline.io.masks import write_keep_mask
 from pipeline.io.scene import ImageRecord, read_images_json
 from pipeline.masking.masks import (
-    dilate, enhanced, lens_fixedness, temporal_mean, threshold, without_specks,
+    dilate,
+    enhanced,
+    lens_fixedness,
+    temporal_mean,
+    threshold,
+    without_specks,
 )  # fmt: skip
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run

@@ -21,7 +21,7 @@ from pipeline.stage import Job, Section, run
 class Params(Section):
     """The section `report` of params.yaml."""
 
-    compare: str | None
+    compare: Annotated[str, Field(description="a variant; '.' for none")]
     picture_size: Annotated[int, Field(ge=64, le=4096)]
     quality: Annotated[int, Field(ge=1, le=100)]
 
@@ -35,9 +35,10 @@ def main(job: Job, params: Params) -> str:
             f"Set report.compare: {job.variant} and leave --variant away.",
         )
     metrics = read_json(paths.metrics, made_by="evaluate")
-    other_paths = ScenePaths(job.root, job.scene, params.compare) if params.compare else None
+    wanted = "" if params.compare == "." else params.compare
+    other_paths = ScenePaths(job.root, job.scene, wanted) if wanted else None
     other = gather.optional_json(other_paths.metrics) if other_paths else {}
-    compared = params.compare if params.compare and other else ""
+    compared = wanted if other else ""
     records = read_images_json(paths.images)
     pictures = map_named(
         gather.photo_pictures,

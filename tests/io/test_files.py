@@ -105,7 +105,9 @@ def test_tensors_and_their_metadata_come_back_with_the_same_bytes(tmp_path: Path
     metadata = {str(number): "x" * number for number in range(20)}
     save_tensors(tmp_path / "one.safetensors", tensors, metadata)
     save_tensors(tmp_path / "two.safetensors", dict(reversed(tensors.items())), metadata)
-    assert (tmp_path / "one.safetensors").read_bytes() == (tmp_path / "two.safetensors").read_bytes()
+    assert (tmp_path / "one.safetensors").read_bytes() == (
+        tmp_path / "two.safetensors"
+    ).read_bytes()
     back, header = load_tensors(tmp_path / "one.safetensors")
     assert header == metadata
     assert all(np.array_equal(back[name], tensors[name]) for name in tensors)

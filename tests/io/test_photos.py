@@ -15,7 +15,9 @@ FOCAL_35MM = 0xA405
 EXIF_IFD = 0x8769
 
 
-def _photo(path: Path, size: tuple[int, int] = (40, 30), orientation: int = 1, focal: int = 0) -> Path:
+def _photo(
+    path: Path, size: tuple[int, int] = (40, 30), orientation: int = 1, focal: int = 0
+) -> Path:
     """A photo whose stored top left corner is red and top right corner is green."""
     pixels = np.full((size[1], size[0], 3), 90, np.uint8)
     pixels[:8, :8] = (250, 0, 0)
@@ -53,7 +55,9 @@ def test_portrait_and_landscape_of_one_camera_get_one_size(tmp_path: Path) -> No
     }
     turns = common_turns(photos)
     assert turns == {"a.jpg": 0, "b.jpg": 0, "c.jpg": 0}, "all in the frame of the sensor"
-    portraits = {name: examine(_photo(tmp_path / name, orientation=6)) for name in ("d.jpg", "e.jpg")}
+    portraits = {
+        name: examine(_photo(tmp_path / name, orientation=6)) for name in ("d.jpg", "e.jpg")
+    }
     assert set(common_turns(portraits).values()) == {270}, "all portrait: upright"
 
 

@@ -1,0 +1,89 @@
+"""The plan of the house, held to: imports run one way, and DVC knows what each stage imports."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import grimp
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+# What every stage runs on and what cannot change a result: flags, folders, threads, error texts.
+RUNNER = {
+    "pipeline",
+    "pipeline.errors",
+    "pipeline.stage",
+    "pipeline.params",
+    "pipeline.parallel",
+    "pipeline.io",
+    "pipeline.io.atomic",
+    "pipeline.io.paths",
+}
+
+
+@functools.cache
+def _graph() -> Any:
+    return grimp.build_graph("pipeline", "stages", cache_dir=None)
+
+
+def true_code_dependencies(stage: str) -> set[str]:
+    """The rooms that a stage imports, directly or not; `io`, which all share, file by file."""
+    modules = _graph().find_upstream_modules(f"stages.{stage}") - RUNNER
+    paths = set()
+    for module in modules:
+        parts = module.split(".")
+        if parts[0] != "pipeline":
+            continue
+        paths.add("/".join(parts) + ".py" if parts[1] == "io" else "/".join(parts[:2]))
+    return paths
+
+
+def _stages() -> dict[str, dict[str, Any]]:
+    content = yaml.safe_load((ROOT / "dvc.yaml").read_text())
+    return {name: entry["do"] for name, entry in content["stages"].items()}
+
+
+@pytest.mark.parametrize("name", _stages() if (ROOT / "dvc.yaml").exists() else [])
+def test_dvc_lists_exactly_the_code_that_a_stage_imports(name: str) -> None:
+    entry = _stages()[name]
+    stage = entry["cmd"].split("stages.")[1].split()[0]
+    listed = {dep for dep in entry["deps"] if dep.startswith("pipeline/")}
+    assert listed == true_code_dependencies(stage)
+    assert f"stages/{stage}.py" in entry["deps"]
+
+
+@pytest.mark.parametrize("name", _stages() if (ROOT / "dvc.yaml").exists() else [])
+def test_dvc_lists_the_parameters_that_a_stage_reads(name: str) -> None:
+    entry = _stages()[name]
+    stage = entry["cmd"].split("stages.")[1].split()[0]
+    scene = "${item.scene}" if "--variant" in entry["cmd"] else "${key}"
+    expected = {stage, f"scenes.{scene}.{stage}"}
+    if "--variant" in entry["cmd"]:
+        expected.add("variants.${item.variant}")
+    assert set(entry["params"]) == expected
+
+
+def test_imports_run_one_way() -> None:
+    linter = Path(sys.executable).with_name("lint-imports")
+    done = subprocess.run([linter, "--no-cache"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_library_files_stay_small() -> None:
+    lines = {path: path.read_text().count("\n") for path in ROOT.glob("pipeline/**/*.py")}
+    assert not {str(path.relative_to(ROOT)) for path, count in lines.items() if count > 400}
+
+
+def test_png_can_be_written_after_the_sfm_library_is_loaded() -> None:
+    """pycolmap exports a zlib of its own; loaded before the system's, it makes PNG writers abort."""
+    program = (
+        "import pipeline, pycolmap, cv2, numpy as np;"
+        "assert cv2.imencode('.png', np.zeros((64, 64, 3), np.uint8))[0]"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()

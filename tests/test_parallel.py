@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+
+from pipeline.errors import UserError
+from pipeline.io.images import write_image
+from pipeline.io.photos import convert, examine
+from pipeline.parallel import map_named
+
+
+def _square(number: int) -> int:
+    return number * number
+
+
+def _thread(_: int) -> int:
+    return threading.get_ident()
+
+
+def _fails(number: int) -> int:
+    if number == 2:
+        raise ValueError("two is not wanted")
+    return number
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as running:
+        yield running.scheduler_address
+
+
+def test_results_come_in_the_order_of_the_names() -> None:
+    items = {name: (number,) for number, name in enumerate("zyxab")}
+    assert list(map_named(_square, items, job_label="test").items()) == [
+        ("a", 9), ("b", 16), ("x", 4), ("y", 1), ("z", 0),
+    ]  # fmt: skip
+
+
+def test_work_leaves_the_calling_thread() -> None:
+    threads = map_named(_thread, {str(n): (n,) for n in range(8)}, job_label="test", workers=2)
+    assert threading.get_ident() not in threads.values()
+
+
+def test_a_failure_names_its_item() -> None:
+    items = {f"image_{number}.png": (number,) for number in range(4)}
+    with pytest.raises(RuntimeError, match=r"image_2\.png.*two is not wanted"):
+        map_named(_fails, items, job_label="test")
+
+
+def test_a_users_fault_stays_one_and_names_its_item(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("no photo")
+    with pytest.raises(UserError, match=r"a\.jpg"):
+        map_named(examine, {"a.png": (tmp_path / "a.jpg",)}, job_label="test")
+
+
+def test_a_cluster_of_two_processes_writes_the_same_bytes(tmp_path: Path, cluster: str) -> None:
+    rng = np.random.default_rng(0)
+    for number in range(5):
+        write_image(tmp_path / f"{number}.png", rng.random((40, 50, 3)))
+    for folder, scheduler in (("threads", None), ("cluster", cluster)):
+        items = {
+            f"{number}": (tmp_path / f"{number}.png", tmp_path / folder / f"{number}.png", 90, 30)
+            for number in range(5)
+        }
+        sizes = map_named(convert, items, job_label="test", scheduler=scheduler)
+        assert set(sizes.values()) == {(24, 30)}
+    for number in range(5):
+        here = (tmp_path / "threads" / f"{number}.png").read_bytes()
+        assert here == (tmp_path / "cluster" / f"{number}.png").read_bytes()
+
+
+def test_a_fault_on_the_cluster_names_its_item(tmp_path: Path, cluster: str) -> None:
+    (tmp_path / "a.jpg").write_text("no photo")
+    with pytest.raises(UserError, match=r"a\.jpg is not an image"):
+        map_named(examine, {"a.png": (tmp_path / "a.jpg",)}, job_label="test", scheduler=cluster)
+
+
+def test_no_scheduler_is_a_sentence() -> None:
+    with pytest.raises(UserError, match="no Dask scheduler answers"):
+        map_named(_square, {"a": (1,)}, job_label="test", scheduler="tcp://127.0.0.1:9")

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import Field
+
+from pipeline.errors import UserError
+from pipeline.params import Section, read_params, read_section, stage_names
+
+
+class Masks(Section):
+    threshold: Annotated[float, Field(ge=0, le=1)]
+    temporal_mean: Literal["auto", "on", "off"]
+    dilation: Annotated[int, Field(ge=0)]
+
+
+GOOD = """
+scenes:
+  demo: {masks: {}}
+  tree: {masks: {threshold: 0.2}}
+variants:
+  wide: {masks: {dilation: 9}}
+masks: {threshold: 3e-1, temporal_mean: on, dilation: 2}
+"""
+
+
+def _file(tmp_path: Path, text: str = GOOD) -> Path:
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_values_are_read_as_dvc_reads_them(tmp_path: Path) -> None:
+    """YAML 1.2: `3e-1` is a number and `on` is a word."""
+    params = read_section(_file(tmp_path), "masks", Masks, "demo")
+    assert (params.threshold, params.temporal_mean) == (0.3, "on")
+
+
+def test_a_scene_and_a_variant_have_values_of_their_own(tmp_path: Path) -> None:
+    file = _file(tmp_path)
+    assert read_section(file, "masks", Masks, "tree").threshold == 0.2
+    both = read_section(file, "masks", Masks, "tree", "wide")
+    assert (both.threshold, both.dilation) == (0.2, 9)
+
+
+def test_every_problem_is_told_at_once_with_the_nearest_name(tmp_path: Path) -> None:
+    text = GOOD.replace("3e-1", "1.5").replace("dilation: 2", "dilatoin: 2")
+    with pytest.raises(UserError) as caught:
+        read_section(_file(tmp_path, text), "masks", Masks, "demo")
+    sentence = str(caught.value)
+    assert "masks.threshold" in sentence
+    assert "1.5" in sentence
+    assert "masks.dilatoin is unknown. Did you mean dilation?" in sentence
+    assert "masks.dilation is missing" in sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("masks: [", "not valid YAML"),
+        ("- a\n- b", "sections of key: value"),
+        ("", "sections of key: value"),
+        (GOOD.replace("\nmasks:", "\nmaskz:"), "unknown section: maskz. Did you mean masks?"),
+        (GOOD.replace("tree: {masks", "tree: {mask"), "unknown section in scenes.tree: mask"),
+        (GOOD.replace("threshold: 3e-1", "threshold: .nan"), "masks.threshold"),
+        ("scenes: {demo: {}}", "the section masks is missing"),
+        ("scenes: {demo: {}}\nmasks: 3", "key: value"),
+    ],
+)
+def test_faults_of_the_file_are_sentences(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(UserError, match=sentence.replace("?", r"\?")):
+        read_section(_file(tmp_path, text), "masks", Masks, "demo")
+
+
+def test_an_unknown_scene_names_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"scenes\.dem does not exist\. Did you mean demo\?"):
+        read_section(_file(tmp_path), "masks", Masks, "dem")
+
+
+def test_the_shipped_file_is_valid_and_complete() -> None:
+    """Each stage's model accepts its section as shipped: every key there, none unknown."""
+    import importlib
+
+    file = Path(__file__).resolve().parents[1] / "params.yaml"
+    scenes = read_params(file)["scenes"]
+    for stage in stage_names():
+        params_type = importlib.import_module(f"stages.{stage}").Params
+        for scene in scenes:
+            read_section(file, stage, params_type, scene)
+        optional = [
+            key for key, field in params_type.model_fields.items() if not field.is_required()
+        ]
+        assert not optional, (
+            f"{stage}: params.yaml must hold {optional}, so the model gives no defaults"
+        )
