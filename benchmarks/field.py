@@ -1,0 +1,125 @@
+"""Rays per second and PSNR over time: the fast field and the paper's NeRF, on one core and two.
+
+    python -m benchmarks.field                     # about three minutes
+    python -m benchmarks.field --seconds 60 --paper-seconds 600
+
+The scene is cast here: textured boxes, 24 views, exact poses, every eighth view held out. Times are
+wall times of the fit alone, beside the processor's time per step; the machine should be idle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "field"))
+
+from scene import camera, photograph  # noqa: E402
+
+from pipeline.field.buffer import PosedPhoto, RayBuffer  # noqa: E402
+from pipeline.field.fit import fit  # noqa: E402
+from pipeline.field.model import build, grid_sizes, scene_space  # noqa: E402
+from pipeline.field.render import render_view  # noqa: E402
+
+VIEWS, SIZE, FOCAL, NEAR, FAR = 24, (400, 300), 380.0, 2.2, 25.0
+INTRINSICS = (FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.0)
+
+
+class OutOfTime(Exception):
+    """The time given to one row of the table is used up."""
+
+
+class Row(NamedTuple):
+    """One row of the table."""
+
+    model: str
+    threads: int
+    steps: int
+    seconds: float
+    cpu_ms: float
+    rays_per_second: float
+    psnr: float
+    render_seconds: float
+
+
+def scene() -> tuple[list[PosedPhoto], list[PosedPhoto]]:
+    """Photos to fit, and photos held out."""
+    photos = []
+    for index in range(VIEWS):
+        pose = camera(index, VIEWS)
+        image, _ = photograph(pose, *SIZE, FOCAL)
+        keep = np.ones(image.shape[:2], bool)
+        photos.append(PosedPhoto(str(index), image, keep, pose, INTRINSICS, NEAR, FAR))
+    return [p for i, p in enumerate(photos) if i % 8], photos[::8]
+
+
+def measure(
+    model_name: str, threads: int, seconds: float, steps: int, batch: int, held_out_views: int
+) -> Row:
+    """Fit for ``seconds`` of wall time on a schedule of ``steps``, then render and compare."""
+    train, test = scene()
+    cams = np.stack([p.cam_from_world for p in train + test])
+    count = len(cams)
+    space = scene_space(
+        "ndc", cams, np.tile(INTRINSICS, (count, 1)), np.tile(SIZE, (count, 1)), NEAR, FAR
+    )
+    model = build(model_name, grid_sizes(space, 512) if model_name == "fast" else {}, space, 0)
+    buffer = RayBuffer(train, 0)
+    buffer.batch(0, batch)  # the first epoch is shuffled before the clock starts
+    begin, cpu, done = time.perf_counter(), time.process_time(), 0
+
+    def progress(step: int, loss: float, psnr: float) -> None:
+        nonlocal done
+        done = step
+        if time.perf_counter() - begin > seconds:
+            raise OutOfTime
+
+    try:
+        every = 25 if model_name == "fast" else 1
+        fit(model, buffer, steps=steps, batch_rays=batch, seed=0, threads=threads,
+            log_every=every, progress=progress)  # fmt: skip
+    except OutOfTime:
+        pass
+    wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
+    torch.set_num_threads(threads)
+    begin, errors = time.perf_counter(), []
+    for photo in test[:held_out_views]:
+        view = render_view(model, photo.cam_from_world, INTRINSICS, SIZE, NEAR, FAR)
+        errors.append(-10 * np.log10(float(((view.rgb - photo.image) ** 2).mean())))
+    each = (time.perf_counter() - begin) / max(1, len(errors))
+    psnr = float(np.mean(errors)) if errors else float("nan")
+    return Row(model_name, threads, done, wall, 1e3 * cpu / done, done * batch / wall, psnr, each)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, nargs="+", default=[10.0, 30.0])
+    parser.add_argument("--paper-seconds", type=float, default=30.0)
+    parser.add_argument("--steps-per-second", type=float, default=15.0, help="for the schedule")
+    flags = parser.parse_args()
+    print(f"{'model':6} {'threads':>7} {'steps':>6} {'fit s':>7} {'cpu ms/step':>11} "
+          f"{'rays/s':>9} {'PSNR dB':>8} {'s/view':>7}")  # fmt: skip
+    jobs = [
+        ("fast", threads, seconds, max(50, int(seconds * flags.steps_per_second)), 4096, 3)
+        for seconds in flags.seconds
+        for threads in (1, 2)
+    ]
+    jobs += [("paper", threads, flags.paper_seconds, 200_000, 1024, 0) for threads in (1, 2)]
+    for job in jobs:
+        row = measure(*job)
+        psnr = f"{row.psnr:8.2f}" if np.isfinite(row.psnr) else "       -"
+        print(f"{row.model:6} {row.threads:7d} {row.steps:6d} {row.seconds:7.1f} "
+              f"{row.cpu_ms:11.1f} {row.rays_per_second:9,.0f} {psnr} "
+              f"{row.render_seconds:7.2f}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
