@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 from tqdm import tqdm
 
 from pipeline.drops import mitsuba_scene, places, synthesis
@@ -22,7 +22,6 @@ from pipeline.io.photos import list_photos
 from pipeline.stage import Job, Section, run
 
 MARKER = "truth/synthesize.json"
-Positive = Annotated[float, Field(gt=0)]
 Side = Annotated[int, Field(ge=16, le=8192)]
 
 
@@ -40,7 +39,7 @@ class Params(Section):
     spp: Annotated[int, Field(ge=1)]
     clean_spp: Annotated[int, Field(ge=1)]
     coverage: Annotated[float, Field(gt=0, lt=0.7)]
-    radius_mm: tuple[Positive, Positive]
+    radius_mm: tuple[PositiveFloat, PositiveFloat]
     pane_m: Annotated[float, Field(ge=0.03, le=2)]
     aperture_mm: Annotated[float, Field(ge=0, le=20)]
     depth: bool
@@ -60,8 +59,8 @@ def _encode(path: Path, image: np.ndarray, quality: int | None = None) -> None:
 
 def _rendered(params: Params, work: Path) -> dict[str, Any]:
     """Renders the views that `work` does not hold yet; returns the true cameras."""
-    focal = synthesis.focal_px(params.width, params.field_of_view_deg)
-    camera = mitsuba_scene.Camera(params.width, params.height, focal, params.aperture_mm / 1000)
+    optics = {"width", "height", "field_of_view_deg", "aperture_mm"}
+    camera = synthesis.camera_of(**params.model_dump(include=optics))
     poses, drops = synthesis.scene_plan(
         params.mode, params.seed, params.views, camera,
         pane_m=params.pane_m, coverage=params.coverage, radius_mm=params.radius_mm,
@@ -80,6 +79,7 @@ def _rendered(params: Params, work: Path) -> dict[str, Any]:
         _encode(work / f"truth/clean/{stems[k]}.jpg", view.clean, 98)
         _encode(work / f"truth/coverage/{stems[k]}.png", view.coverage)
         if params.depth:
+            (work / "truth/depth").mkdir(exist_ok=True)
             write_depth(work / f"truth/depth/{stems[k]}.exr", view.depth)
         _encode(work / f"{stems[k]}.jpg", view.rainy, 95)  # last: it says that the view is done
     return synthesis.cameras(camera, dict(zip(stems, poses, strict=True)))
@@ -87,9 +87,9 @@ def _rendered(params: Params, work: Path) -> dict[str, Any]:
 
 def _painted(params: Params, source: Path, work: Path) -> None:
     """Wets the photos of a folder, the same drops in the sensor's frame of each."""
+    keys = {"seed", "pane_m", "coverage", "radius_mm", "aperture_mm", "field_of_view_deg"}
     for path in tqdm(list_photos(source, 1).values(), desc="painting photos"):
         clean = synthesis.shrunk(read_photo(path)[0], max(params.width, params.height))
-        keys = {"seed", "pane_m", "coverage", "radius_mm", "aperture_mm", "field_of_view_deg"}
         rainy, coverage = synthesis.painted(clean, **params.model_dump(include=keys))
         _encode(work / f"truth/clean/{path.stem}.jpg", clean, 98)
         _encode(work / f"truth/coverage/{path.stem}.png", coverage)
@@ -106,14 +106,11 @@ def main(job: Job, params: Params) -> str:
     recipe = params.model_dump(mode="json")
     key = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
     work = job.paths.work("synthesize") / key
-    (work / "truth/depth").mkdir(parents=True, exist_ok=True)
     if params.mode == "paint":
         _painted(params, job.resolve(params.source), work)
     else:
         write_json(work / "truth/cameras.json", _rendered(params, work))
     write_json(work / MARKER, recipe)
-    if not params.depth or params.mode == "paint":
-        (work / "truth/depth").rmdir()
     with publish_dir(final) as fresh:
         shutil.copytree(work, fresh, dirs_exist_ok=True)
     shutil.rmtree(work)

@@ -18,7 +18,7 @@ from pipeline.errors import UserError
 if TYPE_CHECKING:
     from pipeline.drops.places_parts import TexturedMesh
 
-Array = npt.NDArray[np.float32]
+Array = npt.NDArray[Any]  # float32 where it is stored
 SCALE = 10.0  # Mitsuba units per metre: its ray offset biases millimetre drops in metre units
 VARIANT = "llvm_ad_rgb"
 LIGHT = "vertex_light"

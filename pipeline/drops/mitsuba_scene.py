@@ -14,7 +14,7 @@ from pipeline.drops import shape as drop_shape
 from pipeline.drops.bake import SCALE, bake, hit_radiance, mitsuba, shape, sky_emitter
 from pipeline.drops.places import Place
 
-Array = npt.NDArray[np.float32]
+Array = npt.NDArray[Any]  # float32 where it is stored
 WATER_IOR = 1.333
 MAX_EVENTS = 14
 
@@ -57,7 +57,7 @@ def _integrator() -> Any:
 
     mi = mitsuba()
 
-    class BakedLight(mi.SamplingIntegrator):  # type: ignore[misc,name-defined]
+    class BakedLight(mi.SamplingIntegrator):  # type: ignore[name-defined]
         """Specular chain, then texture times baked light; AOVs alpha, distance, hit."""
 
         def __init__(self, props: Any) -> None:
@@ -232,7 +232,7 @@ def trajectory(
     """
     columns = max(1, round(np.sqrt(views * 1.5)))
     rows = int(np.ceil(views / columns))
-    poses = []
+    poses: list[npt.NDArray[np.float64]] = []
     for k in range(views):
         row, column = divmod(k, columns)
         column = column if row % 2 == 0 else columns - 1 - column
@@ -243,7 +243,7 @@ def trajectory(
         world_from_cam = np.eye(4)
         world_from_cam[:3, :3] = _rotation(yaw, pitch, roll)
         world_from_cam[:3, 3] = np.array([x, y, 0.0]) + jitter
-        poses.append(np.linalg.inv(world_from_cam))
+        poses.append(np.asarray(np.linalg.inv(world_from_cam), np.float64))
     return poses
 
 

@@ -7,11 +7,12 @@ A surface's texture runs u to the right and v down as seen from outside, and its
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float32]
+Array = npt.NDArray[Any]  # float32 where it is stored
 Vec = npt.ArrayLike
 WHITE = (1.0, 1.0, 1.0)
 
@@ -124,7 +125,7 @@ class Builder:
         r = turn(yaw) if tilt is None else turn(yaw) @ tilt
         c, (w, h, d) = np.asarray(centre, np.float32), np.asarray(size, np.float32)
         x, y, z = r @ np.array([w, 0, 0]), r @ np.array([0, h, 0]), r @ np.array([0, 0, d])
-        more = {
+        more: dict[str, Any] = {
             "tile": tile,
             "cell": cell,
             "tint": tint,
@@ -218,5 +219,7 @@ class Builder:
             starts = np.cumsum([0] + [len(p[0]) for p in parts[:-1]])
             arrays = [np.concatenate([p[k] for p in parts]).astype(np.float32) for k in range(5)]
             faces = np.concatenate([p[5] + s for p, s in zip(parts, starts, strict=True)])
-            out.append(TexturedMesh(name, *arrays, faces.astype(np.uint32), self.textures[name]))
+            v, n, uv, tint, glow = arrays
+            faces = faces.astype(np.uint32)
+            out.append(TexturedMesh(name, v, n, uv, tint, glow, faces, self.textures[name]))
         return out

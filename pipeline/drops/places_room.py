@@ -12,6 +12,10 @@ Rng = np.random.Generator
 LampPair = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
+def _xyz(point: Array) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])
+
+
 def textures(rng: Rng) -> dict[str, Array]:
     """The room's materials."""
     brick = ((0.62, 0.36, 0.28), (0.54, 0.30, 0.24), (0.66, 0.44, 0.34))
@@ -164,8 +168,8 @@ def table(b: Builder, rng: Rng, foot: Array, yaw: float, lamps: list[LampPair]) 
     r, w, d, h = turn(yaw), rng.uniform(1.3, 1.8), 0.8, 0.75
     tint = rng.uniform(0.6, 1.3) * np.ones(3)
     b.box("wood", foot + offset(0, -h, 0), (w, 0.05, d), yaw=yaw, tint=tint, tile=0.7, step=0.12)
-    for x in (-1, 1):
-        for z in (-1, 1):
+    for x in (-1.0, 1.0):
+        for z in (-1.0, 1.0):
             b.box(
                 "wood",
                 foot + r @ np.array([x * (w / 2 - 0.06), -h / 2, z * (d / 2 - 0.06)]),
@@ -187,7 +191,7 @@ def table(b: Builder, rng: Rng, foot: Array, yaw: float, lamps: list[LampPair]) 
                 tint=(1.0, 0.85, 0.6),
                 glow=0.8,
             )
-            lamps.append((tuple(float(v) for v in spot - offset(0, 0.40, 0)), (1.2, 0.9, 0.55)))
+            lamps.append((_xyz(spot - offset(0, 0.40, 0)), (1.2, 0.9, 0.55)))
         else:
             thing(b, rng, spot.astype(np.float32), rng.uniform(0.18, 0.3))
     for side in (-1, 1):
@@ -345,10 +349,10 @@ def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
         b.ball(
             "paint", at(x, tall - drop - 0.24, z), np.full(3, 0.07), glow=1.5, tint=(1, 0.85, 0.6)
         )
-        lamps.append((tuple(float(v) for v in at(x, tall - drop - 0.36, z)), (2.2, 1.7, 1.1)))
+        lamps.append((_xyz(at(x, tall - drop - 0.36, z)), (2.2, 1.7, 1.1)))
     # Lamps behind the camera, out of its sight.
     for x in (-1.6, 1.6):
-        lamps.append((tuple(float(v) for v in at(x, tall - 0.5, -0.3)), (5.5, 4.8, 3.9)))
+        lamps.append((_xyz(at(x, tall - 0.5, -0.3)), (5.5, 4.8, 3.9)))
     for _ in range(4):
         spot = at(rng.uniform(-2.5, 2.5), 0, rng.uniform(3.8, 6.5))
         b.box(

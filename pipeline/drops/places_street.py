@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from pipeline.drops import places_textures as tx
@@ -170,7 +172,7 @@ def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
         if kind == "plaster"
         else rng.uniform(0.8, 1.15, 3)
     )
-    wall = {"tile": 1.6, "tint": tint, "shift": tuple(rng.random(2))}
+    wall: dict[str, Any] = {"tile": 1.6, "tint": tint, "shift": tuple(rng.random(2))}
     b.panel(kind, left + up * height, right * width, -up * height, **wall)
     for end in (left, left + right * width):  # the gable ends
         b.panel(kind, end + up * height - out * 3, out * 3, -up * height, **wall)
@@ -280,13 +282,13 @@ def build(rng: Rng) -> Builder:
     notice(b, rng, at(slots[4] * 0.8, 0, rng.uniform(5.2, 6.8)))
     lamp_post(b, rng, at(slots[5] * 0.8, 0, rng.uniform(5.0, 6.3)))
     lamp_post(b, rng, at(-slots[5], 0, rng.uniform(8.0, 9.5)))
-    start = rng.uniform(-3.2, 0.6)
+    first = rng.uniform(-3.2, 0.6)
     z = rng.uniform(4.3, 4.9)
     railing(
         b,
         rng,
-        at(start, -0.12, z),
-        at(start + rng.uniform(2.0, 3.0), -0.12, z + rng.uniform(-0.2, 0.2)),
+        at(first, -0.12, z),
+        at(first + rng.uniform(2.0, 3.0), -0.12, z + rng.uniform(-0.2, 0.2)),
     )
     for _ in range(3):
         bin_(b, rng, at(rng.uniform(-4, 4), 0, rng.uniform(6.7, 9.0)))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float32]
+Array = npt.NDArray[Any]  # float32 where it is stored
 Rng = np.random.Generator
 
 WORDS = ("BAKERY", "BOOKS", "CAFE LUNA", "FLORIST", "TEA ROOM", "No 27", "MARKET", "TO LET")
@@ -70,7 +71,9 @@ def courses(
     return (stone * body[..., None] + mortar * (1 - body[..., None])).astype(np.float32)
 
 
-def plaster(rng: Rng, colour: Sequence[float], *, size: int = 512, rough: float = 0.12) -> Array:
+def plaster(
+    rng: Rng, colour: Sequence[float] | Array, *, size: int = 512, rough: float = 0.12
+) -> Array:
     """Rough render or concrete: two scales of noise, cracks and stains."""
     stains = np.minimum(noise(rng, size, 4, 3), 0.3) * 0.14
     cracks = (

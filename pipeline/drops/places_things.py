@@ -245,12 +245,12 @@ def wires(b: Builder, rng: Rng) -> None:
         b.tube("metal", line, 0.012, sides=4)
         for p in line[1:-1]:
             colour = rng.uniform(0.15, 1.0, 3)
-            v = [p + offset(-0.13, 0, 0), p + offset(0.13, 0, 0), p + offset(0, 0.3, 0)]
+            v = p + np.array([[-0.13, 0, 0], [0.13, 0, 0], [0, 0.3, 0]])
             b.add(
                 "cloth",
                 v,
                 np.tile([0, -0.2, -1.0], (3, 1)),
-                [[0, 0], [0.05, 0], [0.02, 0.2]],
+                np.array([[0, 0], [0.05, 0], [0.02, 0.2]]),
                 [[0, 1, 2]],
                 colour,
             )

@@ -35,6 +35,14 @@ def focal_px(width: int, field_of_view_deg: float) -> float:
     return float(width / 2 / np.tan(np.radians(field_of_view_deg) / 2))
 
 
+def camera_of(
+    width: int, height: int, field_of_view_deg: float, aperture_mm: float
+) -> scene.Camera:
+    """Camera of that many pixels, horizontal field of view and lens radius."""
+    focal = focal_px(width, field_of_view_deg)
+    return scene.Camera(width, height, focal, aperture_mm / 1000)
+
+
 def lens_drops(
     rng: np.random.Generator,
     camera: scene.Camera,

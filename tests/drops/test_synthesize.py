@@ -85,7 +85,7 @@ def test_sky_is_up_and_where_it_should_be() -> None:
     place = wall()
     sky = np.zeros((32, 64, 3), np.float32)
     sky[:16, :, 2] = 1.0
-    sky[:16, 32:48, 0] = 1.0  # red from straight ahead to the right
+    sky[:16, 48:, 0] = 1.0  # red from the right to behind
     open_air = replace(place, sky=sky)
     pose = np.diag([-1.0, 1.0, -1.0, 1.0])  # looking back, away from the wall
     back = ms.render(
@@ -96,8 +96,8 @@ def test_sky_is_up_and_where_it_should_be() -> None:
     right = ms.render(
         ms.bake_place(open_air, rays=4, bounces=0), CAMERA, turned, spp=4, seed=1
     ).radiance
-    # Looking along +x, straight ahead (+z) is to the left.
-    assert right[:8, 2:6, 0].mean() > 0.9 and right[:8, -6:-2, 0].mean() < 0.1
+    # Looking along +x, what lies behind (-z) is to the right.
+    assert right[:8, -6:-2, 0].mean() > 0.9 and right[:8, 2:6, 0].mean() < 0.1
 
 
 @ray_traced
