@@ -1,6 +1,6 @@
 """Ray-traced pairs (rainy, coverage, clean) for training the drop detector.
 
-`python experiments/drops_training.py OUT --seeds 100 110 --views 8` writes
+`python -m experiments.drops_training OUT --seeds 100 110 --views 8` writes
 OUT/{rainy,coverage,clean}/NNN.png. Even seeds are streets, odd ones rooms. Every view has a drop
 pattern, a pane and an aperture of its own, unless --shared fixes one pattern to the lens per seed.
 Seeds below 100 are left to the scenes that detectors are judged on.
