@@ -67,7 +67,7 @@ def main(job: Job, params: Params) -> str:
         write_sparse(found.model, fresh / "sparse")
         write_transforms(fresh / "transforms.json", found.views.values())
         write_json(fresh / "poses.json", _summary(found, records))
-    if len(found.model_sizes) > 1:
+    if found.lost and len(found.model_sizes) > 1:
         log.warning("models of %s photos were found; the largest is used", found.model_sizes)
     return (
         f"{len(found.views)} of {len(records)} photos placed, {len(found.points_xyz)} points, "

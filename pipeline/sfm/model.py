@@ -15,7 +15,8 @@ from pipeline.io.transforms import View
 
 WIDEST_DEG = 170.0
 NARROWEST_DEG = 2.0
-DEPTH_PERCENTILES = (0.5, 99.5)
+DEPTH_PERCENTILES = (1.0, 99.0)
+SURE_VIEWS = 3  # a wrong match of two photos makes a point at any depth; a third photo rules it out
 
 
 def largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
@@ -31,8 +32,8 @@ def registered_names(model: pycolmap.Reconstruction) -> list[str]:
 def views_of(model: pycolmap.Reconstruction, margin: float) -> dict[str, View]:
     """The registered images as views, sorted by name.
 
-    `near` and `far` are the 0.5th and 99.5th percentile of the depths of the points that the image
-    observes, widened by the share `margin`.
+    `near` and `far` are the 1st and 99th percentile of the depths of the points that the image and
+    two others observe, widened by the share `margin`; of all points where an image has none.
     """
     views = {}
     everything = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
@@ -66,8 +67,9 @@ def _depth_range(
     everything: np.ndarray,
     margin: float,
 ) -> tuple[float, float]:
-    seen = [model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()]
-    for points in (np.array(seen).reshape(-1, 3), everything):
+    seen = [model.points3D[p.point3D_id] for p in image.get_observation_points2D()]
+    sure = [point.xyz for point in seen if len(point.track.elements) >= SURE_VIEWS]
+    for points in (np.array(sure).reshape(-1, 3), everything):
         depth = points @ pose[2, :3] + pose[2, 3]
         depth = depth[depth > 0]
         if len(depth):
