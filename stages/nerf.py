@@ -6,7 +6,6 @@ import hashlib
 import json
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import torch
 from pydantic import Field
 from tqdm import tqdm
@@ -15,12 +14,10 @@ from pipeline.errors import UserError
 from pipeline.field.buffer import PosedPhoto, RayBuffer
 from pipeline.field.fit import Record, fit
 from pipeline.field.grid_field import GridField
-from pipeline.field.model import build, describe, grid_sizes, scene_space
+from pipeline.field.model import build_around, describe
 from pipeline.field.paper_field import PaperField
 from pipeline.io.atomic import publish_dir, write_json, write_text
-from pipeline.io.images import read_image
-from pipeline.io.masks import read_keep_mask
-from pipeline.io.scene import read_images_json
+from pipeline.io.posed import read_posed_images
 from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.io.transforms import View, read_transforms
 from pipeline.parallel import cores
@@ -80,29 +77,20 @@ def main(job: Job, params: Params) -> str:
     )
 
 
-def camera_numbers(view: View) -> tuple[float, float, float, float, float]:
-    """fx, fy, cx, cy, k1 of a view."""
-    return view.fx, view.fy, view.cx, view.cy, view.k1
-
-
 def _photos(
     job: Job, params: Params, views: dict[str, View], near: float, far: float
 ) -> tuple[list[PosedPhoto], str]:
     """The photos to fit, and a key of everything that decides the result."""
     digest = hashlib.sha256(json.dumps(params.model_dump(), sort_keys=True).encode())
     digest.update((job.paths.poses / "transforms.json").read_bytes() + job.device.encode())
+    masks = job.paths.masks if params.use_masks else None
     photos = []
-    for record in read_images_json(job.paths.images):
-        view = views.get(record.name)
-        if view is None or record.split != "train":
-            continue
-        image = read_image(job.paths.images / record.name)
-        keep_mask = np.ones(image.shape[:2], bool)
-        if params.use_masks:
-            keep_mask = read_keep_mask(job.paths.masks / record.name, (view.width, view.height))
-        digest.update(record.name.encode() + image.tobytes() + keep_mask.tobytes())
-        pose, camera = view.cam_from_world, camera_numbers(view)
-        photos.append(PosedPhoto(record.name, image, keep_mask, pose, camera, near, far))
+    for image in read_posed_images(job.paths.images, masks, views):
+        if image.record.split == "train":
+            name, view = image.record.name, image.view
+            digest.update(name.encode() + image.rgb.tobytes() + image.keep_mask.tobytes())
+            pose, camera = view.cam_from_world, view.intrinsics
+            photos.append(PosedPhoto(name, image.rgb, image.keep_mask, pose, camera, near, far))
     if not photos:
         raise UserError(
             "None of the photos with a pose is for fitting (every 8th is held out).",
@@ -114,15 +102,10 @@ def _photos(
 def _field(
     params: Params, views: dict[str, View], near: float, far: float
 ) -> GridField | PaperField:
-    cams = np.stack([view.cam_from_world for view in views.values()])
-    intrinsics = np.array([camera_numbers(view) for view in views.values()])
-    sizes = np.array([(view.width, view.height) for view in views.values()])
-    space = scene_space(params.space, cams, intrinsics, sizes, near, far)
-    if params.model == "paper":
-        return build("paper", {}, space, params.seed)
-    same = ("samples", "levels", "features", "table_log2", "distortion")
-    config: dict[str, Any] = {key: getattr(params, key) for key in same}
-    return build("fast", config | grid_sizes(space, params.resolution), space, params.seed)
+    same = ("space", "seed", "resolution")
+    config = ("samples", "levels", "features", "table_log2", "distortion")
+    chosen: dict[str, Any] = {key: getattr(params, key) for key in (*same, *config)}
+    return build_around(params.model, list(views.values()), near, far, **chosen)
 
 
 def _fit(

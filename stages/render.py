@@ -113,8 +113,7 @@ def _witness(masks: Path, out: Path, name: str) -> tuple[np.ndarray, np.ndarray]
 
 def _count_seen(view: View, train: tuple[View, ...], masks: Path, out: Path) -> dict[str, float]:
     def witness(one: View) -> Witness:
-        camera = (one.fx, one.fy, one.cx, one.cy, one.k1)
-        return Witness(one.cam_from_world, camera, *_witness(masks, out, one.name))
+        return Witness(one.cam_from_world, one.intrinsics, *_witness(masks, out, one.name))
 
     count = witness_count(witness(view), [witness(one) for one in train])
     write_map(out / "seen" / f"{Path(view.name).stem}.exr", count.astype(np.float32))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -13,6 +13,19 @@ from pipeline.errors import UserError
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.paper_field import PaperConfig, PaperField
 from pipeline.geometry.spaces import Space, fit_space
+
+
+class Camera(Protocol):
+    """What a field needs of a view: ``cam_from_world`` ``(4, 4)``, fx, fy, cx, cy, k1, the size."""
+
+    @property
+    def cam_from_world(self) -> np.ndarray: ...
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float, float]: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
 
 
 def scene_space(
@@ -59,6 +72,31 @@ def build(model: str, config: Mapping[str, Any], space: Space, seed: int) -> Gri
     if model == "paper":
         return PaperField(PaperConfig(**values), space, seed)
     return GridField(GridConfig(**values), space, seed)
+
+
+def build_around(
+    model: str,
+    cameras: Sequence[Camera],
+    near: float,
+    far: float,
+    *,
+    space: str = "auto",
+    seed: int = 0,
+    resolution: int = 512,
+    **config: Any,
+) -> GridField | PaperField:
+    """A fresh field around what ``cameras`` see between the depths ``near`` and ``far``.
+
+    ``space`` as in :func:`scene_space`; ``resolution`` vertices of the fast field's finest grid
+    along the longer side; ``config`` overrides fields of GridConfig (the paper's has none here).
+    """
+    cams = np.stack([camera.cam_from_world for camera in cameras])
+    intrinsics = np.array([camera.intrinsics for camera in cameras])
+    sizes = np.array([(camera.width, camera.height) for camera in cameras])
+    around = scene_space(space, cams, intrinsics, sizes, near, far)
+    if model == "paper":
+        return build("paper", {}, around, seed)
+    return build("fast", config | grid_sizes(around, resolution), around, seed)
 
 
 def describe(field: GridField | PaperField) -> dict[str, Any]:

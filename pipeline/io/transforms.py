@@ -45,6 +45,11 @@ class View:
         """(4, 4) inverse of `cam_from_world`."""
         return np.linalg.inv(self.cam_from_world)
 
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float, float]:
+        """fx, fy, cx, cy, k1."""
+        return self.fx, self.fy, self.cx, self.cy, self.k1
+
 
 _NUMBERS = {
     "fl_x": "fx",
