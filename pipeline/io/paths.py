@@ -74,6 +74,10 @@ class ScenePaths:
         return self.out / "views"
 
     @property
+    def restored(self) -> Path:
+        return self.out / "restored"
+
+    @property
     def metrics(self) -> Path:
         return self.out / "metrics.json"
 

@@ -1,0 +1,199 @@
+"""The network of Wen et al. (2023): drops removed from five frames by spatial and temporal attention."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+MULTIPLE = 32
+WIDTH = 256
+FRAMES = 5
+
+
+class Frames(NamedTuple):
+    """quarter and half (B*T,3,h,w), full (B,T,3,H,W), all in [-1,1]; clear (B,T,1,H,W), 0 = drop."""
+
+    quarter: Tensor
+    half: Tensor
+    full: Tensor
+    clear: Tensor
+
+
+class _Wrapped(nn.Module):
+    """A convolution under the name `conv`, as the released state dict has it."""
+
+    def __init__(self, inputs: int, outputs: int, size: int, bias: bool) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, size, 1, size // 2, bias=bias)
+
+
+class _Gate(_Wrapped):
+    def __init__(self, relu: bool) -> None:
+        super().__init__(WIDTH, WIDTH, 1, bias=False)
+        self.relu = relu
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.conv(x)) if self.relu else self.conv(x)
+
+
+class _MaskRise(_Wrapped):
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 3, bias=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.conv(F.interpolate(x, scale_factor=2, mode="nearest")))
+
+
+class _Sequence(nn.Module):
+    """Layers under the name `model`."""
+
+    def __init__(self, *layers: nn.Module) -> None:
+        super().__init__()
+        self.model = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.model(x)
+
+
+def _halve(inputs: int, outputs: int) -> _Sequence:
+    return _Sequence(nn.Conv2d(inputs, outputs, 3, 2, 1), nn.ReLU())
+
+
+def _double(inputs: int, outputs: int) -> _Sequence:
+    rise = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
+    return _Sequence(rise, nn.Conv2d(inputs, outputs, 3, 1, 1), nn.ReLU())
+
+
+class _Residual(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv_block = nn.Sequential(
+            nn.ReflectionPad2d(1),
+            nn.Conv2d(WIDTH, WIDTH, 3),
+            nn.ReLU(),
+            nn.Dropout(0.5),
+            nn.ReflectionPad2d(1),
+            nn.Conv2d(WIDTH, WIDTH, 3),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv_block(x)
+
+
+class _PatchAttention(nn.Module):
+    """Scaled dot-product attention between patches; the channels are shared out among patch sizes."""
+
+    def __init__(self, patches: tuple[int, ...]) -> None:
+        super().__init__()
+        self.patches = patches
+        self.query_embedding = nn.Conv2d(WIDTH, WIDTH, 1)
+        self.value_embedding = nn.Conv2d(WIDTH, WIDTH, 1)
+        self.key_embedding = nn.Conv2d(WIDTH, WIDTH, 1)
+        self.output_linear = nn.Sequential(nn.Conv2d(WIDTH, WIDTH, 3, 1, 1), nn.LeakyReLU(0.2))
+
+    def forward(self, x: Tensor, groups: int) -> Tensor:
+        """x (B*T,256,h,w); the patches of the B*T / groups frames of a group attend to each other."""
+        count, _, height, width = x.shape
+        share = WIDTH // len(self.patches)
+        embeddings = (self.query_embedding, self.key_embedding, self.value_embedding)
+        split = [embedding(x).split(share, 1) for embedding in embeddings]
+        heads = []
+        for patch, query, key, value in zip(self.patches, *split, strict=True):
+            q, k, v = (
+                F.unfold(part, patch, stride=patch)
+                .view(groups, count // groups, share * patch * patch, -1)
+                .transpose(2, 3)
+                .flatten(1, 2)
+                for part in (query, key, value)
+            )
+            weights = torch.softmax(q @ k.transpose(1, 2) / math.sqrt(q.shape[-1]), dim=-1)
+            out = (weights @ v).view(count, -1, share * patch * patch).transpose(1, 2)
+            heads.append(F.fold(out, (height, width), patch, stride=patch))
+        return self.output_linear(torch.cat(heads, 1))
+
+
+class _FeedForward(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Sequential(
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=2, dilation=2),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
+            nn.LeakyReLU(0.2),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(x)
+
+
+class _AttentionBlock(nn.Module):
+    def __init__(self, patches: tuple[int, ...]) -> None:
+        super().__init__()
+        self.attention = _PatchAttention(patches)
+        self.feed_forward = _FeedForward()
+
+    def forward(self, x: Tensor, groups: int) -> Tensor:
+        x = x + self.attention(x, groups)
+        return x + self.feed_forward(x)
+
+
+class WenNet(nn.Module):
+    """Dry frames and a map of clear pixels from wet frames. 15,826,314 numbers, the released names.
+
+    Source: Q. Wen et al., "Video Waterdrop Removal via Spatio-Temporal Fusion in Driving Scenes",
+    ICRA 2023 (doi:10.1109/ICRA48891.2023.10160990), and the layers of its released code.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.main_branch = nn.Sequential(
+            nn.ReflectionPad2d(3), nn.Conv2d(3, 64, 7), nn.ReLU(), _halve(64, 128), _halve(128, 256)
+        )
+        self.weight_branch = nn.Sequential(_Gate(relu=True), _Gate(relu=False))
+        self.res_branch_1 = nn.Sequential(_Residual(), _Residual())
+        self.res_branch_2 = nn.Sequential(_Residual(), _Residual())
+        self.spatial_attention = nn.ModuleList([_AttentionBlock((2,))])
+        self.temporal_attention = nn.ModuleList(_AttentionBlock((8, 4)) for _ in range(4))
+        self.upsample_block = nn.Sequential(
+            _double(256, 128),
+            _double(128, 64),
+            nn.ReflectionPad2d(3),
+            nn.Conv2d(64, 3, 7),
+            nn.Tanh(),
+        )
+        self.mask_branch = nn.Sequential(
+            nn.ReLU(),
+            _MaskRise(256, 128),
+            _MaskRise(128, 64),
+            nn.Conv2d(64, 1, 3, 1, 1),
+            nn.Sigmoid(),
+        )
+        self.side_branch_1 = nn.Sequential(nn.Conv2d(256, 3, 3, 1, 1), nn.Tanh())
+        self.side_branch_2 = nn.Sequential(nn.Conv2d(128, 3, 3, 1, 1), nn.Tanh())
+
+    def forward(self, frames: Tensor) -> Frames:
+        """frames (B,T,3,H,W), red first, in [-1,1]; H and W multiples of 32."""
+        batch, count, _, height, width = frames.shape
+        x = self.res_branch_1(self.main_branch(frames.flatten(0, 1)))
+        gate = self.weight_branch(x)
+        clear = self.mask_branch(gate)
+        x = x * torch.sigmoid(gate)
+        for block in self.spatial_attention:
+            x = block(x, batch * count)
+        x = self.res_branch_2(x)
+        quarter = self.side_branch_1(x)
+        for block in self.temporal_attention:
+            x = block(x, batch)
+        x = self.upsample_block[0](x)
+        half = self.side_branch_2(x)
+        full = self.upsample_block[1:](x)
+        return Frames(
+            quarter,
+            half,
+            full.view(batch, count, 3, height, width),
+            clear.view(batch, count, 1, height, width),
+        )

@@ -1,0 +1,122 @@
+"""Photos of any size pass through the networks, and the stage refuses what it cannot use."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.io.images import read_image, write_image
+from pipeline.io.scene import ImageRecord, write_images_json
+from pipeline.io.tensors import save_tensors
+from pipeline.removal.autoencoder import ContextualAutoencoder
+from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen, window_around
+from pipeline.removal.quan import QuanNet
+from pipeline.removal.wen import WenNet
+from stages import restore
+
+
+def photo(height: int, width: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((height, width, 3), np.float32)
+
+
+def test_windows_stay_within_the_sequence() -> None:
+    assert [window_around(k, 7) for k in (0, 1, 3, 6)] == [
+        (range(0, 5), 0),
+        (range(0, 5), 1),
+        (range(1, 6), 2),
+        (range(2, 7), 4),
+    ]
+    assert window_around(1, 3) == (range(0, 3), 1)
+
+
+def test_attgan_sees_blue_first_and_sides_of_four() -> None:
+    seen = []
+
+    def attend(bgr: torch.Tensor) -> torch.Tensor:
+        seen.append(bgr)
+        return torch.zeros_like(bgr[:, :1])
+
+    image = photo(30, 41)
+    done = clean_attgan(ContextualAutoencoder().eval(), image, attend)
+    assert done.shape == image.shape and done.dtype == np.float32
+    assert done.min() >= 0.0 and done.max() <= 1.0
+    assert tuple(seen[0].shape) == (1, 3, 32, 44)
+    assert np.array_equal(seen[0][0, 0, :30, :41].numpy(), image[..., 2])
+
+
+@pytest.mark.parametrize("size", [(33, 50), (5, 5)])
+def test_quan_and_wen_keep_the_size(size: tuple[int, int]) -> None:
+    image = photo(*size)
+    assert clean_quan(QuanNet().eval(), image).shape == image.shape
+    frames = [photo(*size, seed) for seed in range(3)]
+    assert clean_wen(WenNet().eval(), frames, 1).shape == image.shape
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    images = tmp_path / "artifacts/glass/images"
+    images.mkdir(parents=True)
+    records = []
+    for name in ("a.png", "b.png"):
+        write_image(images / name, photo(24, 32))
+        records.append(ImageRecord(name, name, "0" * 64, 32, 24, None, "train", 0))
+    write_images_json(images, records)
+    monkeypatch.setattr(
+        sys, "argv", ["restore", "--scene", "glass", "--params", str(tmp_path / "p")]
+    )
+    return tmp_path
+
+
+def run_stage(root: Path, weights: str, method: str = "attgan") -> int:
+    (root / "p").write_text(
+        f"scenes: {{glass: {{}}}}\n"
+        f'restore: {{method: {method}, weights: "{weights}", published_edges: true}}\n'
+    )
+    with pytest.raises(SystemExit) as stop:
+        restore.run("restore", restore.Params, restore.main)
+    code = stop.value.code
+    assert isinstance(code, int)
+    return code
+
+
+def test_every_photo_is_restored(scene: Path) -> None:
+    torch.manual_seed(0)
+    whole = {**ContextualAutoencoder().state_dict(), **restore.AttentiveRecurrentNet().state_dict()}
+    save_tensors(scene / "gen.safetensors", whole)
+    torch.save({"state_dict": whole}, scene / "gen.pkl")
+    assert run_stage(scene, "gen.safetensors") == 0
+    out = scene / "artifacts/glass/restored"
+    assert sorted(path.name for path in out.iterdir()) == ["a.png", "b.png", "restored.json"]
+    first = read_image(out / "a.png")
+    assert first.shape == (24, 32, 3)
+    assert run_stage(scene, "gen.pkl") == 0
+    assert np.array_equal(read_image(out / "a.png"), first)
+
+
+@pytest.mark.parametrize(
+    ("weights", "told"),
+    [
+        ("", "restore.weights names no file"),
+        ("none.pkl", "do not exist"),
+        ("bad.pkl", "is not a PyTorch"),
+    ],
+)
+def test_weights_that_cannot_be_used_are_told_in_a_sentence(
+    scene: Path, weights: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (scene / "bad.pkl").write_bytes(b"text")
+    assert run_stage(scene, weights) == 2
+    assert told in capsys.readouterr().err
+    assert not (scene / "artifacts/glass/restored").exists()
+
+
+def test_weights_of_another_network_name_what_is_missing(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_tensors(scene / "other.safetensors", QuanNet().state_dict())
+    assert run_stage(scene, "other.safetensors") == 2
+    assert "det_conv0.0.weight is missing" in capsys.readouterr().err
