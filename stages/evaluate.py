@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.evaluation import lpips
+from pipeline.evaluation import flip, lpips
 from pipeline.evaluation.poses import pose_numbers, read_true_cameras
 from pipeline.evaluation.references import find_references
 from pipeline.evaluation.score import Files, score_image
@@ -45,8 +45,7 @@ def main(job: Job, params: Params) -> str:
         job_label="evaluate",
         scheduler=job.scheduler,
     )
-    reasons = _reasons(job, files, backbone)
-    metrics = summarise(rows, reasons)
+    metrics = summarise(rows, _reasons(job, files, backbone))
     truth = paths.truth / "cameras.json"
     metrics["poses"] = pose_numbers(
         {name: view.cam_from_world for name, view in views.items()},
@@ -56,6 +55,7 @@ def main(job: Job, params: Params) -> str:
     )
     metrics["conventions"] = {
         "data_range": 1.0,
+        "flip": f"LDR, {flip.PIXELS_PER_DEGREE} pixels per degree, mean over pixels and images",
         "lpips_net": lpips.NET,
         "mask_threshold": params.coverage_threshold,
         "psnr": "mean over images of the PSNR of the selected pixels, RGB",
@@ -99,6 +99,8 @@ def _reasons(job: Job, files: Mapping[str, Files], backbone: Path | None) -> dic
             reasons[kind] = f"{_shown(job, job.paths.truth / kind)} does not exist"
     if backbone is None:
         reasons["lpips"] = "evaluate.lpips_backbone names no AlexNet weights"
+    if not flip.AVAILABLE:
+        reasons["flip"] = flip.UNAVAILABLE
     absent = {
         "test": "no held-out view was rendered",
         "fitted": "no view was rendered at a photo's pose",

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.evaluation import flip
 from pipeline.evaluation.image import psnr, ssim
 from pipeline.evaluation.lpips import Lpips, load_lpips, lpips
 from pipeline.evaluation.masks import mask_counts
@@ -78,7 +79,10 @@ def _against(name: str, view: np.ndarray, clean: np.ndarray, keep: np.ndarray) -
 
 
 def _whole(name: str, view: np.ndarray, clean: np.ndarray) -> dict[str, float]:
-    return {f"{name}.psnr": psnr(view, clean), f"{name}.ssim": ssim(view, clean)}
+    numbers = {f"{name}.psnr": psnr(view, clean), f"{name}.ssim": ssim(view, clean)}
+    if flip.AVAILABLE:
+        numbers[f"{name}.flip"] = flip.flip(view, clean)
+    return numbers
 
 
 def _selected(

@@ -17,17 +17,21 @@ DIGITS = 6
 _AVERAGES: dict[str, tuple[str, ...]] = {
     "test.psnr": ("clean", "test"),
     "test.ssim": ("clean", "test"),
+    "test.flip": ("clean", "test", "flip"),
     "test.lpips": ("clean", "test", "lpips"),
     "covered.psnr": ("clean", "test", "covered"),
     "kept.psnr": ("clean", "test", "kept"),
     "fitted.psnr": ("clean", "fitted"),
     "fitted.ssim": ("clean", "fitted"),
+    "fitted.flip": ("clean", "fitted", "flip"),
     "fitted.covered_psnr": ("clean", "fitted", "covered"),
     "composite.psnr": ("clean", "composite"),
     "composite.ssim": ("clean", "composite"),
+    "composite.flip": ("clean", "composite", "flip"),
     "composite.covered_psnr": ("clean", "composite", "covered"),
     "input.psnr": ("clean", "composite"),
     "input.ssim": ("clean", "composite"),
+    "input.flip": ("clean", "composite", "flip"),
     "input.covered_psnr": ("clean", "composite", "covered"),
     "masks.coverage": (),
     "masks.true_coverage": ("coverage",),
@@ -44,7 +48,7 @@ def summarise(rows: Rows, reasons: Mapping[str, str]) -> dict[str, Any]:
     """The numbers of a scene, nested by the dots of their names, floats rounded to 6 digits.
 
     rows: the numbers of every image, see `score_image`. reasons: why something is missing, for any
-    of "clean", "coverage", "lpips", "test", "fitted", "composite". A number that cannot be had is
+    of "clean", "coverage", "lpips", "flip", "test", "fitted", "composite". A number that cannot be had is
     None with `<name>_reason` beside it. PSNR and the like are means over images; mask scores pool
     the pixels of all images.
     """

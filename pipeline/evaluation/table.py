@@ -10,11 +10,12 @@ from typing import Any
 from pipeline.errors import UserError
 from pipeline.io.atomic import read_json
 
-# Heading, dotted name, format. Higher is better but for LPIPS.
+# Heading, dotted name, format. Higher is better but for LPIPS and FLIP.
 COLUMNS = (
     ("test PSNR", "test.psnr", "{:.2f}"),
     ("SSIM", "test.ssim", "{:.3f}"),
     ("LPIPS", "test.lpips", "{:.3f}"),
+    ("FLIP", "test.flip", "{:.3f}"),
     ("covered PSNR", "covered.psnr", "{:.2f}"),
     ("kept PSNR", "kept.psnr", "{:.2f}"),
     ("composite PSNR", "composite.psnr", "{:.2f}"),

@@ -11,6 +11,7 @@ ROWS: tuple[tuple[str, str, str, str, bool | None], ...] = (
     ("Held-out views", "PSNR, dB", "test.psnr", ".2f", True),
     ("Held-out views", "SSIM", "test.ssim", ".4f", True),
     ("Held-out views", "LPIPS", "test.lpips", ".4f", False),
+    ("Held-out views", "FLIP", "test.flip", ".4f", False),
     ("Held-out views", "PSNR under the drops, dB", "covered.psnr", ".2f", True),
     ("Held-out views", "PSNR beside the drops, dB", "kept.psnr", ".2f", True),
     (
