@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.errors import UserError
 from pipeline.field.base import Rays
 from pipeline.geometry.rays import pixel_rays
+from pipeline.io.posed import PosedImage
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,29 @@ class PosedPhoto:
     intrinsics: tuple[float, float, float, float, float]
     near: float
     far: float
+
+
+def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list[PosedPhoto]:
+    """The images that are not held out, in their order; UserError when there is none."""
+    photos = [
+        PosedPhoto(
+            image.record.name,
+            image.rgb,
+            image.keep_mask,
+            image.view.cam_from_world,
+            image.view.intrinsics,
+            near,
+            far,
+        )
+        for image in images
+        if image.record.split == "train"
+    ]
+    if not photos:
+        raise UserError(
+            "None of the photos with a pose is for fitting (every 8th is held out).",
+            "See poses/poses.json for the photos that were lost.",
+        )
+    return photos
 
 
 class RayBuffer:

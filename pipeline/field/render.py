@@ -21,10 +21,23 @@ class RenderedView(NamedTuple):
     opacity: np.ndarray
 
 
+Intrinsics = tuple[float, float, float, float, float]
+
+
+def scaled_camera(
+    intrinsics: Intrinsics, size: tuple[int, int], scale: float
+) -> tuple[Intrinsics, tuple[int, int]]:
+    """fx, fy, cx, cy, k1 and (width, height) of the same camera with ``scale`` times the pixels."""
+    width, height = (max(2, round(side * scale)) for side in size)
+    x, y = width / size[0], height / size[1]
+    fx, fy, cx, cy, k1 = intrinsics
+    return (fx * x, fy * y, cx * x, cy * y, k1), (width, height)
+
+
 def render_view(
     field: Field,
     cam_from_world: np.ndarray,
-    intrinsics: tuple[float, float, float, float, float],
+    intrinsics: Intrinsics,
     size: tuple[int, int],
     near: float,
     far: float,

@@ -43,6 +43,14 @@ def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) 
     return count.reshape(rows.shape)
 
 
+def shares(count: np.ndarray) -> dict[str, float]:
+    """The shares of pixels that no photo saw uncovered (``never``) and that ``fewer_than_3`` saw."""
+    return {
+        "never": round(float((count == 0).mean()), 6),
+        "fewer_than_3": round(float((count < 3).mean()), 6),
+    }
+
+
 def _sees(other: Witness, points: np.ndarray) -> np.ndarray:
     fx, fy, cx, cy, k1 = other.intrinsics
     x, y, z = other.cam_from_world[:3, :3] @ points + other.cam_from_world[:3, 3:]

@@ -122,6 +122,15 @@ def interpolated_path(
     return [_pose(_blend(world, place, width)) for place in places]
 
 
+def camera_path(
+    cams: Sequence[np.ndarray], bounds: tuple[float, float] | None, frames: int
+) -> list[np.ndarray]:
+    """`frames` poses for a video: a spiral with the depth `bounds`, a tour of the cameras without."""
+    if bounds is not None:
+        return spiral_path(cams, near=bounds[0], far=bounds[1], frames=frames)
+    return interpolated_path(cams, frames=frames)
+
+
 def _blend(world: np.ndarray, place: float, width: float) -> np.ndarray:
     """The (3, 4) mean of poses around `place`: weights of the two neighbours, smoothed."""
     index = np.arange(len(world), dtype=np.float64)

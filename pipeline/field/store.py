@@ -1,0 +1,112 @@
+"""A fitted field on disk, and a fit that was interrupted."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.errors import UserError
+from pipeline.field.buffer import PosedPhoto
+from pipeline.field.grid_field import GridField
+from pipeline.field.model import describe, restore
+from pipeline.field.paper_field import PaperField
+from pipeline.io.atomic import read_json, write_json
+from pipeline.io.tensors import load_tensors, save_tensors
+
+log = logging.getLogger(__name__)
+
+
+class Fitted(NamedTuple):
+    """A field and the depths between which it was fitted."""
+
+    field: GridField | PaperField
+    near: float
+    far: float
+
+
+def save_field(
+    folder: Path, field: GridField | PaperField, near: float, far: float, about: Mapping[str, Any]
+) -> None:
+    """Writes `field.safetensors` and `field.json`, which also holds ``about``, into a folder."""
+    tensors = {name: value.detach().cpu() for name, value in field.state_dict().items()}
+    save_tensors(folder / "field.safetensors", tensors)
+    bounds = {"bounds": {"near": near, "far": far}}
+    write_json(folder / "field.json", describe(field) | bounds | dict(about))
+
+
+def load_field(folder: Path, device: str) -> Fitted:
+    """What :func:`save_field` wrote, on ``device``; UserError when missing or damaged.
+
+    The last one stays in memory until its files change: many views are rendered from one field.
+    """
+    file = folder / "field.safetensors"
+    written = file.stat().st_mtime_ns if file.is_file() else 0
+    return _load_field(folder, device, written)
+
+
+@functools.lru_cache(maxsize=1)
+def _load_field(folder: Path, device: str, written: int) -> Fitted:
+    about = read_json(folder / "field.json", made_by="nerf")
+    tensors, _ = load_tensors(folder / "field.safetensors", "Run `python -m stages.nerf` first.")
+    bounds = about["bounds"]
+    return Fitted(restore(about, tensors).to(device), bounds["near"], bounds["far"])
+
+
+def fit_key(
+    field: GridField | PaperField,
+    photos: Sequence[PosedPhoto],
+    settings: Mapping[str, Any],
+    device: str,
+) -> str:
+    """A hash of everything that decides a fit's result: for :class:`Checkpoint`."""
+    about = {"field": describe(field), "settings": dict(settings), "device": device}
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    for photo in photos:
+        numbers = [*photo.intrinsics, photo.near, photo.far]
+        for array in (photo.image, photo.keep_mask, photo.cam_from_world, np.array(numbers)):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+class Checkpoint:
+    """The state of one fit in a file, taken up again only by a fit with the same ``key``.
+
+    A damaged file, or one of another fit, counts as none.
+    """
+
+    def __init__(self, file: Path, key: str) -> None:
+        self.file, self.key = file, key
+
+    def save(self, step: int, state: Mapping[str, Tensor]) -> None:
+        """Replaces the file, whole or not at all."""
+        tensors = {name: value.cpu() for name, value in state.items()}
+        save_tensors(self.file, tensors, {"key": self.key, "step": str(step)})
+
+    def load(self, device: str = "cpu") -> tuple[int, dict[str, Tensor]] | None:
+        """Step and state of this very fit, if it was interrupted."""
+        if not self.file.is_file():
+            return None
+        try:
+            arrays, about = load_tensors(self.file)
+        except UserError as error:
+            log.warning("%s The fit starts over.", error.what)
+            return None
+        if about.get("key") != self.key:
+            return None
+        state = {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
+        return int(about["step"]), state
+
+    def remove(self) -> None:
+        """The fit is done."""
+        self.file.unlink(missing_ok=True)
