@@ -1,0 +1,237 @@
+"""Where the glass is: maps carried from the views onto it, and back.
+
+Drops stay on the glass. On a pane that moves with the camera a drop keeps its pixel; on one that stands
+in the scene it keeps its place on a plane. Maps of several views are averaged there.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+import torch
+
+from pipeline.geometry.poses import invert
+from pipeline.geometry.rays import pixel_rays
+from pipeline.geometry.spaces import mean_camera
+
+MAX_CELLS = 2_000_000
+
+
+class GlassCamera(NamedTuple):
+    """A view's pose (4, 4), its fx, fy, cx, cy, k1 and its size in pixels."""
+
+    cam_from_world: np.ndarray
+    intrinsics: tuple[float, float, float, float, float]
+    width: int
+    height: int
+
+
+class Glass(Protocol):
+    """Glass with a raster of cells that every view looks at."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+
+    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        """A view's (H, W) map on the cells, float32; NaN where the view does not see a cell."""
+
+    def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        """A map of the cells as the view sees it, (H, W) float32; NaN beside the glass."""
+
+
+class LensGlass:
+    """Glass that moves with the camera: each pixel is its own cell."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self.shape = (height, width)
+
+    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        """See :class:`Glass`."""
+        return np.asarray(values, np.float32)
+
+    def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        """See :class:`Glass`."""
+        return np.asarray(values, np.float32)
+
+
+class PaneGlass:
+    """A plane in the scene, with the pixels of the mean camera for cells.
+
+    `pane_from_world` (4, 4) is rigid; the plane is z = 0. The raster spans what the views see of it;
+    cells grow when it would hold more than `max_cells`. ValueError when the mean camera or every view
+    looks away from the plane.
+    """
+
+    def __init__(
+        self,
+        pane_from_world: np.ndarray,
+        cameras: Sequence[GlassCamera],
+        max_cells: int = MAX_CELLS,
+    ) -> None:
+        self.cameras = list(cameras)
+        mean = mean_camera(np.stack([camera.cam_from_world for camera in cameras]))
+        mean_from_pane = mean @ invert(pane_from_world)
+        normal = mean_from_pane[:3, 2]
+        offset = float(normal @ mean_from_pane[:3, 3])
+        # Written so that the mean camera's own axis meets the plane at a positive depth.
+        self.normal = normal if offset > 0 else -normal
+        if abs(offset) < 1e-12 or self.normal[2] <= 0:
+            raise ValueError("the mean camera looks away from the plane")
+        self.views_from_glass = [
+            abs(offset) * moved[:3, :3] + np.outer(moved[:3, 3], self.normal)
+            for moved in (camera.cam_from_world @ invert(mean) for camera in cameras)
+        ]
+        spots = [
+            places[ahead]
+            for view, camera in enumerate(self.cameras)
+            for places, ahead in [self._on_glass(view, _lattice(*camera[1:]))]
+        ]
+        seen = np.concatenate(spots)
+        if not len(seen):
+            raise ValueError("no view looks at the plane")
+        # A grazing view's horizon would stretch the raster without end.
+        self.low, high = np.quantile(seen, 0.002, axis=0), np.quantile(seen, 0.998, axis=0)
+        pixel = 1.0 / float(np.median([camera.intrinsics[0] for camera in cameras]))
+        self.low, extent = self.low - pixel, np.maximum(high - self.low, 0) + 2 * pixel
+        self.cell = pixel * max(1.0, math.sqrt(float(extent.prod()) / pixel**2 / max_cells))
+        columns, rows = np.ceil(extent / self.cell).astype(int)
+        self.shape = (int(rows), int(columns))
+
+    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        """See :class:`Glass`."""
+        camera = self.cameras[view]
+        fx, fy, cx, cy, k1 = camera.intrinsics
+        across = (self.low[0] + (np.arange(self.shape[1]) + 0.5) * self.cell)[None, :]
+        down = (self.low[1] + (np.arange(self.shape[0]) + 0.5) * self.cell)[:, None]
+        across, down = across.astype(np.float32), down.astype(np.float32)
+        x, y, z, front = (
+            np.float32(row[0]) * across + (np.float32(row[1]) * down + np.float32(row[2]))
+            for row in (*self.views_from_glass[view], self.normal)
+        )
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y = x / z, y / z
+            # Far outside its frame a lens with k1 < 0 folds points back into it.
+            framed = (np.abs(x) * fx < camera.width) & (np.abs(y) * fy < camera.height)
+            gain = 1.0 + k1 * (x * x + y * y)
+            x, y = fx * x * gain + (cx - 0.5), fy * y * gain + (cy - 0.5)
+        x[~((z > 0) & (front > 0) & framed)] = -1e6
+        return _sample(values, x, y)
+
+    def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        """See :class:`Glass`."""
+        camera = self.cameras[view]
+        rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
+        spots, ahead = self._on_glass(view, _directions(camera.intrinsics, columns, rows))
+        cells = (spots - self.low) / self.cell - 0.5
+        cells[~ahead] = -1e6
+        x, y = cells.astype(np.float32).T.reshape(2, camera.height, camera.width)
+        return _sample(values, x, y)
+
+    def _on_glass(self, view: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where a view's rays (3, N) meet the plane, as the mean camera sees it: (N, 2), and which do."""
+        spots = np.linalg.inv(self.views_from_glass[view]) @ directions
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = (spots[:2] / spots[2]).T
+        # Depths in the view and in the mean camera: both in front.
+        ahead = (spots[2] > 0) & (self.normal @ spots > 0) & np.isfinite(places).all(axis=1)
+        return places, ahead
+
+
+def pane_before(
+    cams: np.ndarray, distance: float, tilt_x_deg: float = 0.0, tilt_y_deg: float = 0.0
+) -> np.ndarray:
+    """`pane_from_world` (4, 4) of a plane across the mean axis of cameras `cams` (V, 4, 4).
+
+    Parallel to the mean image plane at `distance` in front of the mean camera, then turned about the
+    point where the axis meets it: by `tilt_x_deg` about the camera's x axis, and after that by
+    `tilt_y_deg` about its y axis.
+    """
+    a, b = math.radians(tilt_x_deg), math.radians(tilt_y_deg)
+    about_x = np.array([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])
+    about_y = np.array([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
+    pane_from_mean = np.eye(4)
+    pane_from_mean[:3, :3] = (about_y @ about_x).T
+    pane_from_mean[:3, 3] = -pane_from_mean[:3, :3] @ np.array([0.0, 0.0, distance])
+    return pane_from_mean @ mean_camera(np.asarray(cams, np.float64))
+
+
+def pane_depths(pane_from_world: np.ndarray, camera: GlassCamera) -> tuple[float, float]:
+    """The nearest and the farthest depth at which a view's rays meet the pane; inf where none does."""
+    pane_from_cam = pane_from_world @ invert(camera.cam_from_world)
+    along = pane_from_cam[2, :3] @ _lattice(*camera[1:])
+    with np.errstate(divide="ignore"):
+        depth = -pane_from_cam[2, 3] / along
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    return (float(depth.min()), float(depth.max())) if depth.size else (math.inf, math.inf)
+
+
+def window(count: int, middle: int, width: int) -> range:
+    """The `width` neighbours in order of view `middle` among `count` views; 0: all of them."""
+    if width <= 0 or width >= count:
+        return range(count)
+    first = min(max(0, middle - width // 2), count - width)
+    return range(first, first + width)
+
+
+def gather(
+    glass: Glass, maps: Sequence[np.ndarray | None], views: Sequence[int], quantile: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The views' maps on the glass: their mean (eq. 5's, per cell) or a quantile, and the votes.
+
+    `maps[view]` (H, W) may hold NaN for pixels without a vote; None for a view without a map. Out come
+    float32 values, NaN where nobody votes, and the number of votes per cell, int32.
+    """
+    stack = np.stack(
+        [glass.from_view(view, values) for view in views if (values := maps[view]) is not None]
+    )
+    votes = np.isfinite(stack).sum(axis=0).astype(np.int32)
+    if quantile is not None:
+        return quantile_over_views(stack, quantile), votes
+    total = np.nansum(stack, axis=0, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        return (total / np.where(votes > 0, votes, np.nan)).astype(np.float32), votes
+
+
+def quantile_over_views(stack: np.ndarray, quantile: float) -> np.ndarray:
+    """The quantile along the first axis of (V, ...) without NaN, linear between neighbours."""
+    ordered = np.sort(stack, axis=0)  # NaN comes last
+    count = np.isfinite(stack).sum(axis=0)
+    place = quantile * np.maximum(count - 1, 0)
+    lower = np.floor(place).astype(np.int64)
+    upper = np.minimum(lower + 1, np.maximum(count - 1, 0))
+    low = np.take_along_axis(ordered, lower[None], axis=0)[0]
+    high = np.take_along_axis(ordered, upper[None], axis=0)[0]
+    return (low + (high - low) * (place - lower)).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=64)
+def _lattice(
+    intrinsics: tuple[float, float, float, float, float], width: int, height: int
+) -> np.ndarray:
+    """Directions (3, N), in the camera's frame, of pixels around the frame and across it."""
+    columns, rows = np.meshgrid(np.linspace(0, width - 1, 13), np.linspace(0, height - 1, 13))
+    return _directions(intrinsics, columns.ravel(), rows.ravel())
+
+
+def _directions(
+    intrinsics: tuple[float, float, float, float, float], columns: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """Directions (3, N) of pixels in their camera's frame, with z = 1."""
+    u, v = (torch.from_numpy(np.asarray(pixel, np.float64)) for pixel in (columns, rows))
+    numbers = torch.tensor(intrinsics, dtype=torch.float64)
+    return pixel_rays(u, v, numbers, torch.eye(4, dtype=torch.float64)[:3])[1].numpy()
+
+
+def _sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """`values` between its pixels at column and row indices x, y (float32); NaN outside its frame."""
+    pixels = np.asarray(values, np.float32)
+    found = cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    height, width = values.shape
+    found[~((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))] = np.nan
+    return found

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.masking.glass import (
+    LensGlass,
+    PaneGlass,
+    gather,
+    pane_before,
+    pane_depths,
+    quantile_over_views,
+    window,
+)
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from pane_scene import cameras, wetness
+
+
+def test_the_pane_lies_where_it_was_asked_for() -> None:
+    facing = pane_before(np.eye(4)[None], 2.0)
+    assert np.allclose(facing @ [0.3, -0.1, 2.0, 1], [0.3, -0.1, 0, 1])
+    # Turned by 45 degrees about y: the axis still meets it at 2, and its x axis runs away from us.
+    turned = pane_before(np.eye(4)[None], 2.0, 0.0, 45.0)
+    assert np.allclose(turned @ [0, 0, 2.0, 1], [0, 0, 0, 1])
+    assert np.allclose(turned @ [1, 0, 1.0, 1], [np.sqrt(2), 0, 0, 1])
+    turned = pane_before(np.eye(4)[None], 2.0, 45.0, 0.0)
+    assert np.allclose(turned @ [0, 1, 3.0, 1], [0, np.sqrt(2), 0, 1])
+
+
+@pytest.mark.parametrize("tilts", [(0.0, 0.0), (20.0, -25.0)])
+def test_views_agree_on_the_pane_and_get_their_map_back(tilts: tuple[float, float]) -> None:
+    views = cameras(8)
+    pane = pane_before(np.stack([v.cam_from_world for v in views]), 1.5, *tilts)
+    maps = [wetness(pane, view) for view in views]
+    glass = PaneGlass(pane, views)
+    mean, votes = gather(glass, maps, range(8), None)
+    shared = votes >= 2
+    # Cells away from the discs' rims are wholly wet or wholly dry, whoever looks.
+    assert (np.minimum(mean, 1 - mean)[shared] < 0.02).mean() > 0.75
+    for index, own in enumerate(maps):
+        back = glass.to_view(index, mean)
+        assert np.isfinite(back).mean() > 0.98
+        assert ((back > 0.5) == (own > 0.5))[np.isfinite(back)].mean() > 0.97
+
+
+def test_there_and_back_through_a_lens_with_distortion() -> None:
+    views = cameras(2, k1=-0.12)
+    glass = PaneGlass(pane_before(np.stack([v.cam_from_world for v in views]), 1.5, 10, 5), views)
+    rows, columns = np.mgrid[0 : views[0].height, 0 : views[0].width]
+    for plane in (rows, columns):
+        own = plane.astype(np.float32)
+        back = glass.to_view(1, glass.from_view(1, own))
+        inside = np.isfinite(back)
+        inside[[0, -1]] = inside[:, [0, -1]] = False  # beside the rim there is no neighbour to mix
+        assert inside.mean() > 0.8
+        assert np.abs(back - own)[inside].max() < 0.05
+
+
+def test_a_pane_behind_the_cameras_is_refused() -> None:
+    views = cameras(2)
+    with pytest.raises(ValueError, match="looks away"):
+        PaneGlass(pane_before(np.stack([v.cam_from_world for v in views]), -2.0), views)
+
+
+def test_the_raster_stays_within_its_limit() -> None:
+    views = cameras(3)
+    pane = pane_before(np.stack([v.cam_from_world for v in views]), 1.5)
+    rows, columns = PaneGlass(pane, views, max_cells=1000).shape
+    assert 800 < rows * columns < 1100
+
+
+def test_depths_of_a_facing_pane() -> None:
+    view = cameras(1)[0]._replace(cam_from_world=np.eye(4))
+    assert np.allclose(pane_depths(pane_before(np.eye(4)[None], 2.0), view), 2.0)
+    near, far = pane_depths(pane_before(np.eye(4)[None], 2.0, 0.0, 30.0), view)
+    assert near < 1.9 < 2.1 < far
+
+
+def test_on_the_lens_the_mean_is_the_one_of_equation_5() -> None:
+    maps = [np.array([[0.9, 0.0]], np.float32), np.array([[0.3, np.nan]], np.float32), None]
+    mean, votes = gather(LensGlass(1, 2), maps, range(3), None)
+    assert np.allclose(mean, [[0.6, 0.0]])
+    assert votes.tolist() == [[2, 1]]
+
+
+def test_quantiles_by_hand() -> None:
+    stack = np.array([[4.0, np.nan, np.nan], [1.0, 7.0, np.nan], [2.0, 5.0, np.nan]], np.float32)
+    assert np.allclose(quantile_over_views(stack, 0.5), [2.0, 6.0, np.nan], equal_nan=True)
+    assert np.allclose(quantile_over_views(stack, 0.25)[:2], [1.5, 5.5])
+    assert np.allclose(quantile_over_views(stack, 1.0)[:2], [4.0, 7.0])
+
+
+def test_windows_hold_neighbours_and_stay_inside() -> None:
+    assert window(10, 4, 0) == range(10)
+    assert window(10, 4, 3) == range(3, 6)
+    assert window(10, 0, 3) == range(3)
+    assert window(10, 9, 3) == range(7, 10)
+    assert window(5, 2, 9) == range(5)

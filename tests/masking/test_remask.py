@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pipeline.masking.glass import LensGlass
+from pipeline.masking.loop import attention_on_glass, changed_share, redraw_views
+from pipeline.masking.remask import opened, otsu, redraw, without_holes
+from pipeline.masking.residual import exposure, residual
+
+
+def test_otsu_parts_two_heaps_in_their_middle() -> None:
+    values = np.array([0.0, 0.1, 0.2, 4.0, 4.1, 4.2, 4.3])
+    assert 0.2 < otsu(values) < 4.0
+    assert otsu(np.array([3.0, 3.0])) == 3.0
+    # By hand: of the cuts of 0, 1, 5 the one after 1 leaves (0.5 ** 2) * 2, after 0 it leaves 4 * 2.
+    assert 1.0 < otsu(np.array([0.0, 1.0, 5.0])) < 5.0
+
+
+def test_water_has_no_holes_but_a_ring_of_drops_may_stand_around_dry_glass() -> None:
+    drop_mask = np.zeros((40, 60), bool)
+    drop_mask[5:15, 5:15] = True
+    drop_mask[9:11, 9:12] = False  # 6 of 100: a hole
+    drop_mask[10:35, 25:50] = True
+    drop_mask[12:33, 27:48] = False  # 441 inside a frame of 184: dry
+    drop_mask[20, 0] = True
+    filled = without_holes(drop_mask)
+    assert filled[5:15, 5:15].all()
+    assert not filled[20, 30]
+    assert filled.sum() == drop_mask.sum() + 6
+    assert not without_holes(np.zeros((4, 4), bool)).any()
+
+
+def test_opening_keeps_squares_and_drops_lines() -> None:
+    drop_mask = np.zeros((9, 9), bool)
+    drop_mask[1:4, 1:4] = True
+    drop_mask[7, :] = True
+    assert np.array_equal(np.argwhere(opened(drop_mask)), np.argwhere(drop_mask[:6]))
+
+
+def test_a_drop_is_where_the_residual_is_large_and_old_masks_stay_where_nobody_votes() -> None:
+    gathered = np.full((30, 40), 0.01, np.float32)
+    gathered[5:15, 5:15] = 0.1
+    votes = np.full((30, 40), 5)
+    votes[:, 30:] = 1
+    gathered[:, 35:] = np.nan
+    previous = np.zeros((30, 40), bool)
+    previous[20:25, 28:38] = True
+    found = redraw(gathered, votes, previous, 2)
+    expected = np.zeros((30, 40), bool)
+    expected[5:15, 5:15] = True
+    expected[20:25, 30:38] = True
+    assert np.array_equal(found.drop_mask, expected)
+    assert found.known.mean() == pytest.approx(0.75)
+    assert found.contrast == pytest.approx(10.0, rel=1e-3)
+    assert 0.01 < found.level < 0.1
+
+
+def test_without_any_votes_the_old_mask_stays() -> None:
+    previous = np.eye(5, dtype=bool)
+    found = redraw(np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1)
+    assert np.array_equal(found.drop_mask, previous)
+    assert math.isnan(found.contrast)
+
+
+def test_the_exposure_is_matched_and_the_rest_is_residual() -> None:
+    rng = np.random.default_rng(0)
+    render = rng.uniform(0.2, 0.6, (40, 40, 3)).astype(np.float32)
+    gain = np.array([1.2, 0.9, 1.1], np.float32)
+    photo = render * gain
+    keep_mask = np.ones((40, 40), bool)
+    keep_mask[10:20, 10:20] = False
+    photo[10:20, 10:20] = 0.0  # a black drop: covered, so it does not count for the exposure
+    assert np.allclose(exposure(render, photo, keep_mask), gain, atol=1e-4)
+    sure = np.ones((40, 40), bool)
+    sure[30:] = False
+    found = residual(render, photo, keep_mask, sure)
+    assert np.isnan(found[30:]).all()
+    assert found[24:30].max() < 1e-4  # unsure neighbours do not bleed in
+    assert found[14:16, 14:16].min() > 0.2
+    assert np.nanmax(found) <= 0.3 + 1e-6
+
+
+def _drop_scene() -> tuple[list[np.ndarray | None], np.ndarray]:
+    """Residuals of six views with one drop on the lens; each view has a false blob elsewhere."""
+    rng = np.random.default_rng(3)
+    drop = np.zeros((40, 50), bool)
+    drop[10:20, 10:22] = True
+    residuals: list[np.ndarray | None] = []
+    for view in range(6):
+        values = rng.uniform(0.008, 0.012, drop.shape).astype(np.float32)
+        values[drop] = 0.12
+        values[25:32, 7 * view : 7 * view + 6] = 0.2
+        residuals.append(values)
+    residuals[2] = None  # held out
+    return residuals, drop
+
+
+def test_what_stays_on_the_lens_is_a_drop_and_what_does_not_is_given_back() -> None:
+    residuals, drop = _drop_scene()
+    old = [np.zeros(drop.shape, bool) for _ in residuals]
+    for mask in old:
+        mask[30:38, 40:48] = True  # clean, as the residual shows
+    found = redraw_views(LensGlass(40, 50), residuals, old, quantile=0.5, fewest_votes=3)
+    assert all(np.array_equal(mask, drop) for mask in found.drop_masks)
+    assert found.known == 1.0
+    assert changed_share(old, found.drop_masks) == pytest.approx((120 + 64) / 2000)
+
+
+def test_a_window_follows_a_creeping_drop() -> None:
+    count = 12
+    residuals: list[np.ndarray | None] = []
+    truth = []
+    for view in range(count):
+        drop = np.zeros((30, 60), bool)
+        drop[10:20, 3 * view : 3 * view + 10] = True
+        residuals.append(np.where(drop, 0.1, 0.01).astype(np.float32))
+        truth.append(drop)
+    old = [np.zeros((30, 60), bool)] * count
+
+    def overlap(width: int) -> float:
+        found = redraw_views(
+            LensGlass(30, 60), residuals, old, quantile=0.5, fewest_votes=2, width=width
+        )
+        pairs = list(zip(found.drop_masks, truth, strict=True))
+        return sum((a & b).sum() for a, b in pairs) / sum((a | b).sum() for a, b in pairs)
+
+    assert overlap(3) > 0.85
+    assert overlap(0) < 0.2
+
+
+def test_attention_averaged_on_the_glass_by_hand() -> None:
+    maps = [np.array([[0.9, 0.5, 0.0]], np.float32), np.array([[0.5, 0.0, 0.1]], np.float32)]
+    old = [np.zeros((1, 3), bool)] * 2
+    found = attention_on_glass(LensGlass(1, 3), maps, old, 0.3)
+    assert [mask.tolist() for mask in found] == [[[True, False, False]]] * 2

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.masking.sweep import agreement, find_glass
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from pane_scene import cameras, wetness
+
+from pipeline.masking.glass import pane_before
+
+
+def test_agreement_by_hand() -> None:
+    # Two cells, three views: between cells 6 (1 degree of freedom), within 4 / 4; (6 - 1) / (6 + 2 * 1).
+    stack = np.array([[1, 3], [2, 4], [3, 5]], np.float32)
+    assert agreement(stack) == pytest.approx(0.625)
+    # A cell that two views see does not count; one that a fourth view does not see counts as before.
+    more = np.array([[1, 3, 9], [2, 4, 0], [3, 5, np.nan], [np.nan, np.nan, np.nan]], np.float32)
+    assert agreement(more) == pytest.approx(0.625)
+
+
+def test_agreement_is_one_for_the_same_map_and_none_for_noise() -> None:
+    rng = np.random.default_rng(1)
+    same = rng.random((30, 40)).astype(np.float32)
+    assert agreement(np.stack([same] * 4)) == pytest.approx(1.0)
+    assert abs(agreement(rng.random((4, 60, 80)))) < 0.03
+    assert agreement(np.zeros((4, 5, 5))) == 0.0
+    assert agreement(np.stack([same] * 2)) == 0.0  # two views are too few
+
+
+@pytest.mark.parametrize("tilts", [(0.0, 0.0), (20.0, -10.0)])
+def test_the_plane_finds_itself(tilts: tuple[float, float]) -> None:
+    views = cameras(10)
+    cams = np.stack([v.cam_from_world for v in views])
+    pane = pane_before(cams, 1.5, *tilts)
+    rng = np.random.default_rng(0)
+    # Attention of a detector that misses a fifth of the drops' pixels and sees some that are not there.
+    maps = []
+    for view in views:
+        wet = wetness(pane, view)
+        maps.append(np.where(rng.random(wet.shape) < 0.2, rng.random(wet.shape), wet))
+    found = find_glass(maps, views, 4.0, at_least=0.3)
+    assert found.mode == "pane"
+    assert found.distance == pytest.approx(1.5, rel=0.02)
+    assert abs(found.tilt_x_deg - tilts[0]) < 3
+    assert abs(found.tilt_y_deg - tilts[1]) < 3
+    assert found.pane_agreement > 0.4 > found.lens_agreement + 0.3
+
+
+def test_drops_on_the_lens_are_known_by_their_pixels() -> None:
+    views = cameras(10)
+    pane = pane_before(np.stack([v.cam_from_world for v in views]), 1.5)
+    still = wetness(pane, views[0])
+    rng = np.random.default_rng(0)
+    maps = [np.where(rng.random(still.shape) < 0.2, 0.5, still) for _ in views]
+    assert find_glass(maps, views, 4.0, at_least=0.3).mode == "lens"
+
+
+def test_no_glass_in_unrelated_maps_nor_in_a_common_gradient() -> None:
+    views = cameras(10)
+    rng = np.random.default_rng(0)
+    shade = np.linspace(0, 1, views[0].height)[:, None]
+    maps = [(shade + 0.3 * rng.random((60, 80))).astype(np.float32) for _ in views]
+    assert find_glass(maps, views, 4.0, at_least=0.3).mode == "none"
