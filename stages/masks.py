@@ -14,14 +14,7 @@ from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.maps import read_map
 from pipeline.io.masks import write_keep_mask
 from pipeline.io.scene import ImageRecord, read_images_json
-from pipeline.masking.masks import (
-    dilate,
-    enhanced,
-    lens_fixedness,
-    temporal_mean,
-    threshold,
-    without_specks,
-)  # fmt: skip
+from pipeline.masking import masks as masking
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
 
@@ -31,8 +24,9 @@ log = logging.getLogger(__name__)
 class Params(Section):
     """Section `masks`."""
 
-    threshold: Annotated[float, Field(ge=0, le=1)]
+    threshold: Annotated[float, Field(ge=0, le=1)] | Literal["auto"]
     temporal_mean: Literal["auto", "on", "off"]
+    mean_alone: bool
     lens_fixed_from: Annotated[float, Field(ge=0, le=1)]
     dilation: Annotated[int, Field(ge=0, le=100)]
     min_area: Annotated[int, Field(ge=0)]
@@ -42,13 +36,14 @@ def main(job: Job, params: Params) -> str:
     """Makes `artifacts/<scene>/masks/` from the attention maps."""
     records = read_images_json(job.paths.images)
     maps = {record.name: _read_attention(job, record) for record in records}
-    mean = temporal_mean(maps.values())
-    fixed, why = _lens_fixed(list(maps.values()), params)
+    t, chosen = _threshold(list(maps.values()), params)
+    mean = masking.temporal_mean(maps.values())
+    fixed, why = _lens_fixed(list(maps.values()), t, params)
     with publish_dir(job.paths.masks) as fresh:
         coverage = map_named(
             write_mask,
             {
-                name: (attention, mean if fixed else None, fresh / name, params)
+                name: (attention, mean if fixed else None, t, fresh / name, params)
                 for name, attention in maps.items()
             },
             job_label="masks",
@@ -63,10 +58,12 @@ def main(job: Job, params: Params) -> str:
         write_json(
             fresh / "masks.json",
             {
-                "threshold": params.threshold,
+                "threshold": t,
+                "threshold_why": chosen,
                 "dilation": params.dilation,
                 "mode": "lens-fixed" if fixed else "per-image",
                 "why": why,
+                "mean_alone": fixed and params.mean_alone,
                 "coverage": {name: round(value, 6) for name, value in coverage.items()},
                 "mean_coverage": round(share, 6),
                 "fully_masked": everything,
@@ -77,18 +74,17 @@ def main(job: Job, params: Params) -> str:
     if share == 0:
         log.warning("no drops were found in any image; lower masks.threshold if there are some")
     elif share > 0.6:
-        log.warning(
-            "%.0f %% of the pixels are masked; raise masks.threshold if that is too much",
-            100 * share,
-        )
-    return f"{100 * share:.1f} % of the pixels masked, {'lens-fixed' if fixed else 'image by image'} ({why})"
+        log.warning("%.0f %% of the pixels are masked; is masks.threshold too low?", 100 * share)
+    mode = "lens-fixed" if fixed else "image by image"
+    return f"{100 * share:.1f} % of the pixels masked at {t:g}, {mode} ({why})"
 
 
-def write_mask(attention: np.ndarray, mean: np.ndarray | None, path: Path, params: Params) -> float:
+def write_mask(
+    attention: np.ndarray, mean: np.ndarray | None, t: float, path: Path, params: Params
+) -> float:
     """Writes one keep mask and returns the share of pixels it drops."""
-    t = params.threshold
-    drop_mask = threshold(attention, t) if mean is None else enhanced(attention, mean, t)
-    drop_mask = dilate(without_specks(drop_mask, params.min_area), params.dilation)
+    drop_mask = masking.drop_mask_of(attention, mean, t, params.mean_alone)
+    drop_mask = masking.dilate(masking.without_specks(drop_mask, params.min_area), params.dilation)
     write_keep_mask(path, ~drop_mask)
     return float(drop_mask.mean())
 
@@ -104,10 +100,16 @@ def _read_attention(job: Job, record: ImageRecord) -> np.ndarray:
     return attention
 
 
-def _lens_fixed(attentions: list[np.ndarray], params: Params) -> tuple[bool, str]:
+def _threshold(attentions: list[np.ndarray], params: Params) -> tuple[float, str]:
+    if params.threshold != "auto":
+        return params.threshold, "masks.threshold"
+    return masking.automatic_threshold(attentions), "auto: where the maps' values part best"
+
+
+def _lens_fixed(attentions: list[np.ndarray], t: float, params: Params) -> tuple[bool, str]:
     if params.temporal_mean != "auto":
         return params.temporal_mean == "on", f"masks.temporal_mean is {params.temporal_mean}"
-    agreement = lens_fixedness(attentions, params.threshold)
+    agreement = masking.lens_fixedness(attentions, t)
     sign = ">=" if agreement >= params.lens_fixed_from else "<"
     return (
         agreement >= params.lens_fixed_from,

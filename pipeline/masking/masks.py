@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
+AUTOMATIC = (0.2, 0.6)
+
 
 def threshold(attention: np.ndarray, t: float) -> np.ndarray:
     """The (H, W) drop mask M(u, v) = f(A(u, v), t) of equation 3: True where the attention exceeds t."""
@@ -28,6 +30,49 @@ def temporal_mean(attentions: Iterable[np.ndarray]) -> np.ndarray:
 def enhanced(attention: np.ndarray, mean_attention: np.ndarray, t: float) -> np.ndarray:
     """The (H, W) drop mask of equation 5: f(A, t) or f(mean A, t)."""
     return threshold(attention, t) | threshold(mean_attention, t)
+
+
+def drop_mask_of(
+    attention: np.ndarray, mean_attention: np.ndarray | None, t: float, mean_alone: bool = False
+) -> np.ndarray:
+    """The (H, W) drop mask of equation 3, or of equation 5 when there is a mean map.
+
+    `mean_alone`: f(mean A, t) instead, for drops that never move; the view's own map adds noise then.
+    """
+    if mean_attention is None:
+        return threshold(attention, t)
+    return threshold(mean_attention, t) if mean_alone else enhanced(attention, mean_attention, t)
+
+
+def otsu(values: np.ndarray, bins: int = 256) -> float:
+    """The threshold that parts values (N,) into the two classes with the least variance within.
+
+    Otsu 1979, doi:10.1109/TSMC.1979.4310076, on a histogram. The only value when there is one.
+    """
+    low, high = float(values.min()), float(values.max())
+    if high <= low:
+        return low
+    counts, edges = np.histogram(values, bins=bins, range=(low, high))
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    below = np.cumsum(counts).astype(np.float64)
+    sums = np.cumsum(counts * middle)
+    above = below[-1] - below
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gap = sums / below - (sums[-1] - sums) / above
+    between = np.nan_to_num(below * above * gap**2)[:-1]
+    # Between two far clusters many thresholds are equally good: take their middle.
+    best = np.flatnonzero(between >= between.max() * (1 - 1e-12))
+    return float(edges[1:-1][best].mean())
+
+
+def automatic_threshold(attentions: Sequence[np.ndarray]) -> float:
+    """t between 0.2 and 0.6 that parts the maps' values best (Otsu), rounded to two digits.
+
+    The paper chooses t between 0.2 and 0.4 by hand. The bounds hold where there is nothing to part:
+    maps of dry glass have no second class.
+    """
+    values = np.concatenate([attention.ravel() for attention in attentions])
+    return round(float(np.clip(otsu(values), *AUTOMATIC)), 2)
 
 
 def dilate(drop_mask: np.ndarray, pixels: int) -> np.ndarray:

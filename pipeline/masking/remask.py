@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from pipeline.masking.masks import otsu
+
 FLOOR = 1e-3  # residuals below it are equal: 8-bit photos hold no less
 LARGEST_HOLE = 0.25  # of the drop around it
 
@@ -43,27 +45,6 @@ def redraw(
     if inside.size and outside.size:
         contrast = float(np.median(inside) / max(float(np.median(outside)), FLOOR))
     return Redrawn(np.where(known, drop_mask, previous), known, float(np.exp(level)), contrast)
-
-
-def otsu(values: np.ndarray, bins: int = 256) -> float:
-    """The threshold that parts values (N,) into the two classes with the least variance within.
-
-    Otsu 1979, doi:10.1109/TSMC.1979.4310076, on a histogram. The only value when there is one.
-    """
-    low, high = float(values.min()), float(values.max())
-    if high <= low:
-        return low
-    counts, edges = np.histogram(values, bins=bins, range=(low, high))
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    below = np.cumsum(counts).astype(np.float64)
-    sums = np.cumsum(counts * middle)
-    above = below[-1] - below
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gap = sums / below - (sums[-1] - sums) / above
-    between = np.nan_to_num(below * above * gap**2)[:-1]
-    # Between two far clusters many thresholds are equally good: take their middle.
-    best = np.flatnonzero(between >= between.max() * (1 - 1e-12))
-    return float(edges[1:-1][best].mean())
 
 
 def opened(drop_mask: np.ndarray) -> np.ndarray:

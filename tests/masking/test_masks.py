@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.masking.masks import (
     dilate,
+    drop_mask_of,
     enhanced,
     lens_fixedness,
     temporal_mean,
@@ -32,6 +33,14 @@ def test_equation_5_by_hand() -> None:
     assert enhanced(maps[0], mean, 0.5).tolist() == [[True, False, False]]
     assert enhanced(maps[1], mean, 0.5).tolist() == [[True, True, False]]
     assert enhanced(maps[2], mean, 0.5).tolist() == [[True, False, False]]
+
+
+def test_the_mean_alone_forgets_what_one_view_sees() -> None:
+    attention, mean = np.array([[0.9, 0.9, 0.1]]), np.array([[0.6, 0.3, 0.1]])
+    assert drop_mask_of(attention, None, 0.5).tolist() == [[True, True, False]]
+    assert drop_mask_of(attention * 0.5, mean, 0.5).tolist() == [[True, False, False]]
+    assert drop_mask_of(attention, mean, 0.5).tolist() == [[True, True, False]]
+    assert drop_mask_of(attention, mean, 0.5, mean_alone=True).tolist() == [[True, False, False]]
 
 
 def test_a_mean_needs_a_map() -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.masking.glass import LensGlass
 from pipeline.masking.loop import attention_on_glass, changed_share, redraw_views
-from pipeline.masking.remask import opened, otsu, redraw, without_holes
+from pipeline.masking.masks import automatic_threshold, otsu
+from pipeline.masking.remask import opened, redraw, without_holes
 from pipeline.masking.residual import exposure, residual
 
 
@@ -17,6 +18,13 @@ def test_otsu_parts_two_heaps_in_their_middle() -> None:
     assert otsu(np.array([3.0, 3.0])) == 3.0
     # By hand: of the cuts of 0, 1, 5 the one after 1 leaves (0.5 ** 2) * 2, after 0 it leaves 4 * 2.
     assert 1.0 < otsu(np.array([0.0, 1.0, 5.0])) < 5.0
+
+
+def test_the_automatic_threshold_parts_wet_from_dry_within_bounds() -> None:
+    wet = np.concatenate([np.full(700, 0.1), np.full(300, 0.9)]).reshape(20, 50)
+    assert automatic_threshold([wet]) == 0.5
+    assert automatic_threshold([wet * 0.1]) == 0.2
+    assert automatic_threshold([1 - 0.1 * wet]) == 0.6
 
 
 def test_water_has_no_holes_but_a_ring_of_drops_may_stand_around_dry_glass() -> None:
