@@ -25,15 +25,25 @@ WIDTH, HEIGHT = 400, 300
 def random_pane(
     rng: np.random.Generator, light: bool
 ) -> tuple[mitsuba_scene.Camera, float, list[Drop]]:
-    """A camera, the distance of its pane and the drops on it; `light`: as on the judged scenes."""
-    focal = synthesis.focal_px(WIDTH, float(rng.uniform(50, 70)))
+    """A camera, the distance of its pane and the drops on it; `light`: as on the judged scenes.
+
+    Otherwise from sharp specks on a far window to large drops out of focus close to the lens.
+    """
+    focal = synthesis.focal_px(WIDTH, float(rng.uniform(45, 70)))
     while True:
-        pane = 0.12 if light else float(rng.uniform(0.06, 0.25))
-        aperture = 0.001 if light else float(rng.uniform(0, 0.002))
+        pane = 0.12 if light else float(np.exp(rng.uniform(np.log(0.05), np.log(0.5))))
+        blur = float(rng.choice([0.0, rng.uniform(1, 8), rng.uniform(4, 30)]))  # pixels
+        aperture = 0.001 if light else blur * pane / (2 * focal)
         camera = mitsuba_scene.Camera(WIDTH, HEIGHT, focal, aperture)
-        small = float(rng.uniform(1.0, 2.5))
-        radii = (small, float(rng.uniform(small + 1, 5.0 if light else 9.0)))
-        share = float(rng.uniform(0.08, 0.18) if light else rng.uniform(0.05, 0.35))
+        # Radii in pixels, as seen: none so small that its blur leaves nothing of it.
+        small = float(np.exp(rng.uniform(np.log(2), np.log(8))) + 0.3 * blur)
+        large = small * float(rng.uniform(1.3, 4.0))
+        metres = pane / focal * 1000
+        radii = (small * metres, large * metres)
+        if light:
+            small = float(rng.uniform(1.0, 2.5))
+            radii = (small, float(rng.uniform(small + 1, 5.0)))
+        share = float(rng.uniform(0.08, 0.18) if light else rng.uniform(0.03, 0.35))
         try:
             return camera, pane, synthesis.lens_drops(rng, camera, pane, share, radii)
         except UserError:  # too dense for these sizes: draw again

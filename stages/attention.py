@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 
 from pipeline.attention.inference import attend
-from pipeline.attention.network import AttentiveRecurrentNet, load_network
+from pipeline.attention.weights import Detector, load_network
 from pipeline.io.atomic import publish_dir
 from pipeline.io.images import read_image
 from pipeline.io.maps import read_map, write_map
@@ -24,6 +24,7 @@ from pipeline.stage import Job, Section, run
 class Params(Section):
     """Section `attention`."""
 
+    model: Literal["unet", "attentive", "none"]
     weights: Annotated[str, Field(min_length=1)]
     steps: Annotated[int, Field(ge=1, le=16)]
     scales: Annotated[list[Annotated[float, Field(gt=0, le=4)]], Field(min_length=1, max_length=8)]
@@ -33,14 +34,11 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Makes `artifacts/<scene>/attention/`: a map per image, and the mean of all maps."""
     records = read_images_json(job.paths.images)
-    weights = job.resolve(params.weights)
-    load_network(weights)  # what is wrong with the weights is told once, before any work
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-    attributes = {
-        "derainnerf:weights_sha256": digest,
-        "derainnerf:steps": str(params.steps),
-        "derainnerf:scales": " ".join(f"{scale:g}" for scale in params.scales),
-    }
+    weights, digest = job.resolve(params.weights), ""
+    if params.model != "none":
+        load_network(weights, params.model)  # what is wrong is told once, before any work
+        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    attributes = attributes_of(params, digest)
     with publish_dir(job.paths.attention) as fresh:
         shares = map_named(
             attend_image,
@@ -70,6 +68,16 @@ def main(job: Job, params: Params) -> str:
     return f"{len(records)} maps; {mean_share:.1%} of the pixels above 0.3"
 
 
+def attributes_of(params: Params, digest: str) -> dict[str, str | float]:
+    """What a map's header tells of how it was made; digest: of the weights, "" for none."""
+    return {
+        "derainnerf:model": params.model,
+        "derainnerf:weights_sha256": digest,
+        "derainnerf:steps": str(params.steps),
+        "derainnerf:scales": " ".join(f"{scale:g}" for scale in params.scales),
+    }
+
+
 def _added(total: np.ndarray, found: np.ndarray, name: str) -> np.ndarray:
     if total.shape != found.shape:
         raise ValueError(f"{name} has the shape {found.shape}, the images before it {total.shape}")
@@ -85,22 +93,20 @@ def attend_image(
     params: Params,
     attributes: dict[str, str | float],
 ) -> float:
-    """Writes the map of one image; the share of its pixels above 0.3."""
-    found = attend(
-        _network(weights, digest, device),
-        read_image(image),
-        scales=params.scales,
-        tile=params.tile,
-        steps=params.steps,
-    )
+    """Writes the map of one image (without a model: no drop anywhere); its share above 0.3."""
+    pixels = read_image(image)
+    found = np.zeros(pixels.shape[:2], np.float32)
+    if params.model != "none":
+        network = _network(weights, params.model, digest, device)
+        found = attend(network, pixels, scales=params.scales, tile=params.tile, steps=params.steps)
     write_map(out, found, attributes)
     return float((found > 0.3).mean())
 
 
 @lru_cache(maxsize=1)
-def _network(weights: Path, digest: str, device: str) -> AttentiveRecurrentNet:
+def _network(weights: Path, model: str, digest: str, device: str) -> Detector:
     """The network, once per process; the digest makes changed weights a different one."""
-    return load_network(weights).to(torch.device(device))
+    return load_network(weights, model).for_inference().to(torch.device(device))
 
 
 if __name__ == "__main__":

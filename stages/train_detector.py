@@ -1,4 +1,4 @@
-"""Trains the drop detector of `weights/` from painted, rendered and photographed pairs."""
+"""Trains a drop detector of `weights/` from painted, rendered and photographed pairs."""
 
 from __future__ import annotations
 
@@ -6,27 +6,18 @@ import csv
 import hashlib
 import io
 import json
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
 from tqdm import tqdm
 
-from pipeline.attention.network import AttentiveRecurrentNet, load_network
-from pipeline.attention.pools import (
-    CHUNK,
-    Pictures,
-    paint_chunk,
-    read_chunk,
-    read_photo_pairs,
-    read_rendered,
-)
+from pipeline.attention import pools
 from pipeline.attention.samples import Pool
-from pipeline.attention.training import Phase, Score, Trainer, fit, initialise
-from pipeline.errors import UserError
+from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit
+from pipeline.attention.weights import DETECTORS, load_network, save_network
 from pipeline.io.atomic import write_bytes, write_text
-from pipeline.io.tensors import save_tensors
+from pipeline.io.paths import ScenePaths
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
 
@@ -44,106 +35,88 @@ class PhaseParams(Section):
 class Params(Section):
     """Section `train_detector`."""
 
+    model: Literal["unet", "attentive"]
     weights: Annotated[str, Field(pattern=r"\.safetensors$")]
     start: str
     seed: Annotated[int, Field(ge=0)]
-    painted: Annotated[int, Field(ge=CHUNK, multiple_of=CHUNK)]
-    validation: Annotated[int, Field(ge=1, le=CHUNK)]
+    photos: str
+    painted: Annotated[int, Field(ge=pools.CHUNK, multiple_of=pools.CHUNK)]
     rendered: list[str]
     photo_pairs: list[str]
     shares: tuple[float, float, float]
     clean_share: Annotated[float, Field(ge=0, le=1)]
+    validation: Annotated[int, Field(ge=1, le=pools.CHUNK)]
+    validation_photos: str
+    validation_rendered: list[str]
     validate_every: Annotated[int, Field(ge=1)]
+    bfloat16: bool
     phases: Annotated[list[PhaseParams], Field(min_length=1)]
 
 
 def main(job: Job, params: Params) -> str:
     """Writes the weights, and beside them the validation curve as CSV."""
     start = job.resolve(params.start) if params.start else None
-    network = load_network(start) if start else AttentiveRecurrentNet()
+    network = load_network(start, params.model) if start else DETECTORS[params.model]()
     if start is None:
-        initialise(network, params.seed)
-    pools, validation = _pools(job, params)
+        network.initialise(params.seed)
+    training, validation = _training(job, params), _validation(job, params)
     phases = [Phase(**phase.model_dump()) for phase in params.phases]
-    trainer = Trainer(
-        network.to(job.device), pools, phases, seed=params.seed, clean_share=params.clean_share
-    )
-    checkpoint = job.paths.work("train_detector") / f"{_key(params, start)}.pt"
-    rows = _resume(checkpoint, trainer)
-    total = sum(phase.iterations for phase in phases)
-    with tqdm(total=total, initial=trainer.done, unit="step") as bar:
+    network.to(job.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    trainer = Trainer(network, training, phases, seed=params.seed,
+                      clean_share=params.clean_share, bfloat16=params.bfloat16)  # fmt: skip
+    told = json.dumps(params.model_dump(exclude={"weights"}), sort_keys=True).encode()
+    key = hashlib.sha256(told + (start.read_bytes() if start else b"")).hexdigest()[:16]
+    checkpoint = job.paths.work("train_detector") / f"{key}.pt"
+    rows: list[list[float | str]] = []
+    if checkpoint.is_file():
+        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        trainer.restore(saved["trainer"])
+        rows = saved["rows"]
+    with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:
 
-        def on_score(done: int, steps: int, loss: float, score: Score) -> None:
+        def on_score(done: int, steps: int, loss: float, found: dict[str, Score]) -> None:
             bar.update(done - bar.n)
-            bar.set_postfix(f1=f"{score.f1:.3f}")
-            figures = (loss, score.mse, score.precision, score.recall, score.f1)
-            rows.append([done, steps, *(round(figure, 6) for figure in figures)])
+            rows.extend(curve_rows(done, steps, loss, found))
+            bar.write(" ".join(f"{name} F1 {each.f1:.3f}" for name, each in found.items()))
             buffer = io.BytesIO()
             torch.save({"trainer": trainer.state(), "rows": rows}, buffer)
             write_bytes(checkpoint, buffer.getvalue())
 
-        average = fit(
-            trainer,
-            validate_every=params.validate_every,
-            validation=validation,
-            on_score=on_score,
-        )
+        average = fit(trainer, validate_every=params.validate_every, validation=validation,
+                      on_score=on_score)  # fmt: skip
     target = job.resolve(params.weights)
-    save_tensors(target, {k: v.cpu() for k, v in average.state_dict().items()})
-    _write_curve(target.with_suffix(".csv"), rows)
-    return f"{target.name}: F1 {rows[-1][-1]:.3f} on {params.validation} painted pictures"
-
-
-def _key(params: Params, start: Path | None) -> str:
-    """Names what a checkpoint belongs to: parameters and starting weights."""
-    told = json.dumps(params.model_dump(), sort_keys=True).encode()
-    return hashlib.sha256(told + (start.read_bytes() if start else b"")).hexdigest()[:16]
-
-
-def _resume(checkpoint: Path, trainer: Trainer) -> list[list[float]]:
-    if not checkpoint.is_file():
-        return []
-    saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    trainer.restore(saved["trainer"])
-    return saved["rows"]
-
-
-def _write_curve(path: Path, rows: list[list[float]]) -> None:
+    save_network(target, average)
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["iteration", "steps", "loss", "mse", "precision", "recall", "f1"])
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+    csv.writer(text, lineterminator="\n").writerows([CURVE, *rows])
+    write_text(target.with_suffix(".csv"), text.getvalue())
+    return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"
 
 
-def _pools(job: Job, params: Params) -> tuple[list[Pool], Pool]:
-    """The pools to train on, and painted pictures of other seeds to validate on."""
-    folder = job.paths.work("train_detector") / f"painted-{params.seed}"
-    chunks = {f"{k:04d}": (folder / f"{k:04d}.npz", params.seed, k)
-              for k in range(params.painted // CHUNK + 1)}  # fmt: skip
-    map_named(paint_chunk, chunks, job_label="painting")
-    *training, last = [read_chunk(path) for path, _, _ in chunks.values()]
-    painted: Pictures = ([], [], [])
-    rendered: Pictures = ([], [], [])
-    photos: Pictures = ([], [], [])
-    for chunk in training:
-        _extend(painted, chunk)
-    for path in params.rendered:
-        _extend(rendered, read_rendered(job.resolve(path)))
-    for path in params.photo_pairs:
-        _extend(photos, read_photo_pairs(job.resolve(path)))
-    pools = [Pool(pictures[0], pictures[1], pictures[2], share=share)
-             for pictures, share in zip((painted, rendered, photos), params.shares, strict=True)
-             if pictures[0] and share > 0]  # fmt: skip
-    if not pools:
-        raise UserError("There is nothing to train on.", "Raise train_detector.shares.")
-    few = params.validation
-    return pools, Pool(last[0][:few], last[1][:few], last[2][:few])
+def _painted(job: Job, folder: str, seed: int, count: int) -> pools.Pictures:
+    """Painted pictures on the photos of a folder and on procedural ones, made where missing."""
+    photos = pools.list_pictures(job.resolve(folder)) if folder else ()
+    work = ScenePaths(job.root, job.scene).work("train_detector") / pools.painted_name(seed, photos)
+    chunks = {f"{k:04d}": (work / f"{k:04d}.npy", seed, k, photos)
+              for k in range(-(-count // pools.CHUNK))}  # fmt: skip
+    map_named(pools.paint_chunk, chunks, job_label="painting")
+    return pools.together([pools.read_chunk(chunk[0]) for chunk in chunks.values()], count)
 
 
-def _extend(into: Pictures, more: Pictures) -> None:
-    for old, new in zip(into, more, strict=True):
-        old.extend(new)
+def _training(job: Job, params: Params) -> list[Pool]:
+    sources = (
+        _painted(job, params.photos, params.seed, params.painted),
+        pools.together([pools.read_rendered(job.resolve(path)) for path in params.rendered]),
+        pools.together([pools.read_photo_pairs(job.resolve(path)) for path in params.photo_pairs]),
+    )
+    return pools.weighted(sources, params.shares)
+
+
+def _validation(job: Job, params: Params) -> dict[str, Pool]:
+    """Pictures of other seeds, photos and places than those that are trained on."""
+    painted = _painted(job, params.validation_photos, params.seed + 1, params.validation)
+    folders = [job.resolve(path) for path in params.validation_rendered]
+    rendered = {path.name: Pool(*pools.read_rendered(path)) for path in folders}
+    return {**rendered, "painted": Pool(*painted)}
 
 
 if __name__ == "__main__":

@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.attention.network import STEP_RADIUS, STEPS, AttentiveRecurrentNet, bgr_from_rgb
+from pipeline.attention.network import STEPS, bgr_from_rgb
+from pipeline.attention.weights import Detector
 
 
 def attend(
-    network: AttentiveRecurrentNet,
+    network: Detector,
     image: np.ndarray,
     *,
     scales: Sequence[float] = (1.0,),
@@ -25,10 +26,10 @@ def attend(
     """Where drops are on a photo: (H,W) float32 in [0,1], 1 = a drop.
 
     image: RGB (H,W,3) in [0,1], any size from 1x1. It is computed on the device that holds the
-    network, in tiles of at most tile x tile pixels, each with as many pixels around it as the
-    network sees: the same map as in one piece, at most (tile + 2*13*steps)^2 pixels at a time.
+    network, in tiles of about tile x tile pixels, each with as many pixels around it as the
+    network sees: the same map as in one piece, about (tile + 2*reach)^2 pixels at a time, where
+    reach is 13 per step for the attentive network and 144 for the U-Net.
     scales: factors of the image's size; the maps, brought back to that size, are averaged.
-    The raw output is clamped to [0,1], which the network's last layer does not do.
     """
     if not scales or min(scales) <= 0 or tile < 1 or steps < 1:
         raise ValueError(f"scales {scales}, tile {tile} and steps {steps} must be positive")
@@ -50,34 +51,35 @@ def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(values.astype(np.float32), size, interpolation=how)
 
 
-def _attend_once(
-    network: AttentiveRecurrentNet, image: np.ndarray, tile: int, steps: int
-) -> np.ndarray:
+def _attend_once(network: Detector, image: np.ndarray, tile: int, steps: int) -> np.ndarray:
     bgr = bgr_from_rgb(image)
     height, width = image.shape[:2]
     found = np.empty((height, width), np.float32)
-    halo = STEP_RADIUS * steps
-    for y0, y1 in _spans(height, tile):
-        for x0, x1 in _spans(width, tile):
+    halo = network.reach(steps)
+    for y0, y1 in _spans(height, tile, network.grid):
+        for x0, x1 in _spans(width, tile, network.grid):
             top, left = max(0, y0 - halo), max(0, x0 - halo)
             part = bgr[:, :, top : y1 + halo, left : x1 + halo]
-            piece = _last_map(network, part, steps)
+            piece = _map(network, part, steps)
             found[y0:y1, x0:x1] = piece[y0 - top : y1 - top, x0 - left : x1 - left]
-    return np.clip(found, 0.0, 1.0)
+    return found
 
 
-def _spans(length: int, tile: int) -> Iterator[tuple[int, int]]:
-    """Cuts [0, length) into the fewest spans of at most `tile`, as equal as they can be."""
+def _spans(length: int, tile: int, grid: int) -> Iterator[tuple[int, int]]:
+    """Cuts [0, length) into the fewest spans of about `tile`, as equal as they can be.
+
+    Every span begins at a multiple of `grid`.
+    """
     count = math.ceil(length / tile)
-    edges = [round(length * k / count) for k in range(count + 1)]
-    return pairwise(edges)
+    edges = [round(length * k / count / grid) * grid for k in range(count)]
+    return pairwise(dict.fromkeys([*edges, length]))
 
 
-def _last_map(network: AttentiveRecurrentNet, bgr: Tensor, steps: int) -> np.ndarray:
+def _map(network: Detector, bgr: Tensor, steps: int) -> np.ndarray:
     device = next(network.parameters()).device
     # Full float32 and fixed algorithms: the map is the same every time, on a GPU too.
     exact = torch.backends.cudnn.flags(
         enabled=True, benchmark=False, deterministic=True, allow_tf32=False
     )
     with torch.inference_mode(), exact:
-        return network(bgr.contiguous().to(device), steps)[-1][0, 0].cpu().numpy()
+        return network.attention(bgr.contiguous().to(device), steps)[0, 0].cpu().numpy()

@@ -2,45 +2,94 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from pipeline.attention.samples import coverage_of_pair
+from pipeline.attention.samples import Pool, coverage_of_pair
 from pipeline.drops.backgrounds import sample_background
-from pipeline.drops.pairs import sample_pair
+from pipeline.drops.pairs import sample_shots
 from pipeline.errors import UserError
 from pipeline.io.atomic import write_bytes
-from pipeline.io.images import PHOTO_SUFFIXES, read_photo
+from pipeline.io.images import PHOTO_SUFFIXES, read_photo, shrink
 
 CHUNK = 100
 SIZE = 256
+PHOTO_SHARE = 0.7
+LONGEST = 1200
 KINDS = ("rainy", "clean", "coverage")
 # Rainy (H,W,3), clean (H,W,3) and coverage (H,W), all uint8, in the same order.
 Pictures = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]
 
 
-def paint_chunk(path: Path, seed: int, chunk: int) -> None:
-    """Writes a hundred painted pairs, each from a generator of its own, unless they exist."""
+def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()) -> None:
+    """Writes a hundred painted pictures, each from a generator of its own, unless they exist.
+
+    photos: clean photographs; PHOTO_SHARE of the backgrounds are crops of them, the others are
+    procedural. One array (100,256,256,7) uint8: rainy, clean, coverage.
+    """
     if path.is_file():
         return
-    parts: Pictures = ([], [], [])
+    pictures = np.empty((CHUNK, SIZE, SIZE, 7), np.uint8)
     for k in range(CHUNK):
         rng = np.random.default_rng([seed, chunk, k])
-        clean = sample_background(rng, SIZE)
-        rainy, coverage = sample_pair(rng, clean)
-        for part, picture in zip(parts, (rainy, clean, coverage), strict=True):
-            part.append(np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8))
+        shots = sample_shots(rng, background(rng, photos))
+        stacked = np.dstack(shots)
+        pictures[k] = np.rint(np.clip(stacked, 0, 1) * 255).astype(np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, rainy=parts[0], clean=parts[1], coverage=parts[2])
+    np.save(buffer, pictures)
     write_bytes(path, buffer.getvalue())
 
 
+def painted_name(seed: int, photos: Sequence[Path]) -> str:
+    """A name for pictures painted from this seed and these photos, whatever folder they lie in."""
+    digest = hashlib.sha256(str(seed).encode())
+    for photo in photos:
+        digest.update(photo.read_bytes())
+    return f"painted-{digest.hexdigest()[:12]}"
+
+
+def background(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:
+    """A clean picture (256,256,3) in [0,1]: a crop of a photo at any scale, or a procedural one."""
+    if not photos or rng.random() >= PHOTO_SHARE:
+        return sample_background(rng, SIZE)
+    photo = _photo(photos[int(rng.integers(len(photos)))])
+    shortest = min(photo.shape[:2])
+    # From detail at full size to a whole photo made small, as if seen from further away.
+    side = round(float(np.exp(rng.uniform(np.log(min(0.6 * SIZE, shortest)), np.log(shortest)))))
+    top, left = (int(rng.integers(length - side + 1)) for length in photo.shape[:2])
+    crop = photo[top : top + side, left : left + side].astype(np.float32) / 255
+    how = cv2.INTER_AREA if side > SIZE else cv2.INTER_CUBIC
+    crop = cv2.resize(crop, (SIZE, SIZE), interpolation=how)
+    if rng.random() < 0.5:
+        crop = crop[:, ::-1]
+    crop = crop * np.exp(rng.normal(0, 0.2)) * rng.uniform(0.92, 1.08, 3)
+    return np.clip(crop, 0, 1).astype(np.float32)
+
+
+@lru_cache(maxsize=256)
+def _photo(path: Path) -> np.ndarray:
+    return shrink(read_photo(path)[0], LONGEST)
+
+
 def read_chunk(path: Path) -> Pictures:
-    """The pictures that `paint_chunk` wrote."""
-    with np.load(path) as parts:
-        return list(parts["rainy"]), list(parts["clean"]), list(parts["coverage"])
+    """The pictures that `paint_chunk` wrote, left in the file until they are looked at."""
+    pictures = np.load(path, mmap_mode="r")
+    return (
+        [picture[..., :3] for picture in pictures],
+        [picture[..., 3:6] for picture in pictures],
+        [picture[..., 6] for picture in pictures],
+    )
+
+
+def list_pictures(folder: Path) -> tuple[Path, ...]:
+    """The pictures of a folder in name order; UserError where there are none."""
+    return tuple(folder / name for name in _names(folder))
 
 
 def read_rendered(folder: Path) -> Pictures:
@@ -73,6 +122,27 @@ def read_photo_pairs(folder: Path) -> Pictures:
     return pictures
 
 
+def together(parts: Sequence[Pictures], count: int | None = None) -> Pictures:
+    """All pictures of the parts in order, or the first `count` of them."""
+    whole: Pictures = ([], [], [])
+    for part in parts:
+        for kept, pictures in zip(whole, part, strict=True):
+            kept.extend(pictures)
+    return whole[0][:count], whole[1][:count], whole[2][:count]
+
+
+def weighted(sources: Sequence[Pictures], shares: Sequence[float]) -> list[Pool]:
+    """Pools of the sources that hold pictures and have a share above zero; UserError for none."""
+    pools = [
+        Pool(*source, share=share)
+        for source, share in zip(sources, shares, strict=True)
+        if source[0] and share > 0
+    ]
+    if not pools:
+        raise UserError("There is nothing to train on.", "Raise train_detector.shares.")
+    return pools
+
+
 def _partner(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path} does not exist.", "Every rainy picture needs its partners.")
@@ -88,5 +158,5 @@ def _names(folder: Path) -> list[str]:
     found = [path.name for path in folder.iterdir()] if folder.is_dir() else []
     names = sorted(name for name in found if Path(name).suffix.lower() in PHOTO_SUFFIXES)
     if not names:
-        raise UserError(f"{folder} holds no images.", "weights/README.md tells the layouts.")
+        raise UserError(f"{folder} holds no images.", "docs/detector.md tells the layouts.")
     return names

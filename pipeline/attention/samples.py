@@ -12,10 +12,11 @@ from torch import Tensor
 
 # Any pixel with more water than this counts as a drop: faintly wet pixels spoil a fit as well.
 VISIBLE_COVERAGE = 0.05
-# Where the map is cut to find those pixels; see `wetness`.
-MAP_THRESHOLD = 0.3
 # |rainy - clean| beyond this is a drop in a pair of photos, as in Qian et al. (CVPR 2018).
 PAIR_DIFFERENCE = 30 / 255
+# Water that changes the picture by less than this cannot be seen, and counts for little.
+SEEN_DIFFERENCE = 6 / 255
+UNSEEN_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,12 @@ class Pool:
 
 
 def wetness(coverage: Tensor) -> Tensor:
-    """The map that the network learns, from soft coverage in [0,1]: min(1, 6 coverage).
+    """The map that the network learns, from soft coverage in [0,1]: its square root.
 
-    It saturates early because what matters is whether there is any visible water: a map cut at
-    0.3 marks coverage above 0.05, and the blurred rim of a drop weighs like its core.
+    Faint water counts for more than in the coverage itself (0.05 becomes 0.22), but the map keeps
+    telling the blurred rim of a drop from its core.
     """
-    return (coverage * (MAP_THRESHOLD / VISIBLE_COVERAGE)).clamp(0, 1)
+    return coverage.clamp(0, 1).sqrt()
 
 
 def coverage_of_pair(rainy: np.ndarray, clean: np.ndarray) -> np.ndarray:
@@ -57,27 +58,32 @@ def coverage_of_pair(rainy: np.ndarray, clean: np.ndarray) -> np.ndarray:
 
 def draw_batch(
     pools: Sequence[Pool], rng: np.random.Generator, batch: int, crop: int, clean_share: float
-) -> tuple[Tensor, Tensor]:
-    """A batch of augmented crops: (N,3,crop,crop) BGR in [0,1] and (N,1,crop,crop) coverage.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Augmented crops: (N,3,crop,crop) BGR in [0,1], (N,1,crop,crop) coverage and weight.
 
-    clean_share: the part of the crops that show no drop at all.
+    clean_share: the part of the crops that show no drop at all. The weight in the loss is 1, but
+    small where there is water that changes nothing.
     """
     shares = np.array([pool.share for pool in pools], np.float64)
-    pairs = [
+    drawn = [
         _draw(pools[rng.choice(len(pools), p=shares / shares.sum())], rng, crop, clean_share)
         for _ in range(batch)
     ]
-    images = np.stack([image[..., ::-1].transpose(2, 0, 1) for image, _ in pairs])
-    coverage = np.stack([cover[None] for _, cover in pairs])
-    return torch.from_numpy(np.ascontiguousarray(images)), torch.from_numpy(coverage)
+    images = np.stack([image[..., ::-1].transpose(2, 0, 1) for image, _, _ in drawn])
+    coverage = np.stack([cover[None] for _, cover, _ in drawn])
+    weight = np.stack([weight[None] for _, _, weight in drawn])
+    return (
+        torch.from_numpy(np.ascontiguousarray(images)),
+        torch.from_numpy(coverage),
+        torch.from_numpy(weight),
+    )
 
 
 def _draw(
     pool: Pool, rng: np.random.Generator, crop: int, clean_share: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     index = int(rng.integers(len(pool.rainy)))
     dry = len(pool.clean) > 0 and rng.random() < clean_share
-    source = (pool.clean if dry else pool.rainy)[index]
     cover = pool.coverage[index]
     size = min(_window(rng, crop), *cover.shape)
     places = [(_offset(rng, cover.shape[0], size), _offset(rng, cover.shape[1], size))]
@@ -85,23 +91,41 @@ def _draw(
         places.append((_offset(rng, cover.shape[0], size), _offset(rng, cover.shape[1], size)))
     wet = [int(cover[y : y + size : 4, x : x + size : 4].sum()) for y, x in places]
     y, x = places[int(np.argmax(wet))]
-    image = source[y : y + size, x : x + size].astype(np.float32) / 255
-    part = cover[y : y + size, x : x + size].astype(np.float32) / 255
+    window = (slice(y, y + size), slice(x, x + size))
+    image = (pool.clean if dry else pool.rainy)[index][window].astype(np.float32) / 255
+    part = cover[window].astype(np.float32) / 255
+    weight = np.ones_like(part)
     if dry:
         part = np.zeros_like(part)
+    elif len(pool.clean) > 0:
+        weight = visibility(image, pool.clean[index][window].astype(np.float32) / 255, part)
     if size != crop:
         how = cv2.INTER_AREA if size > crop else cv2.INTER_LINEAR
-        image, part = (cv2.resize(a, (crop, crop), interpolation=how) for a in (image, part))
+        image, part, weight = (
+            np.clip(cv2.resize(a, (crop, crop), interpolation=how), 0, 1)
+            for a in (image, part, weight)
+        )
     if rng.random() < 0.5:
-        image, part = image[:, ::-1], part[:, ::-1]
-    return _photographed(image, rng), np.ascontiguousarray(part)
+        image, part, weight = image[:, ::-1], part[:, ::-1], weight[:, ::-1]
+    image = _photographed(image, rng)
+    return image, np.ascontiguousarray(part), np.ascontiguousarray(weight)
+
+
+def visibility(rainy: np.ndarray, clean: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+    """Weight (H,W) in the loss: 1, or UNSEEN_WEIGHT where water leaves the photo as it was.
+
+    rainy, clean: (H,W,3) in [0,1]; coverage: (H,W). Differences are averaged over 5x5 pixels.
+    """
+    change = cv2.blur(np.abs(rainy - clean).max(axis=2), (5, 5))
+    unseen = (coverage > 0) & (change < SEEN_DIFFERENCE)
+    return np.where(unseen, np.float32(UNSEEN_WEIGHT), np.float32(1))
 
 
 def _window(rng: np.random.Generator, crop: int) -> int:
     """How many pixels a crop takes from the picture: half of them at another scale."""
     if rng.random() < 0.5:
         return crop
-    return round(crop * float(np.exp(rng.uniform(np.log(0.7), np.log(1.8)))))
+    return round(crop * float(np.exp(rng.uniform(np.log(0.6), np.log(2.0)))))
 
 
 def _offset(rng: np.random.Generator, length: int, size: int) -> int:
@@ -116,6 +140,9 @@ def _photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         image = np.power(np.clip(image, 0, 1), np.exp(rng.uniform(-0.35, 0.35)))
         image = image * np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.04, 3))
         image = (image - 0.5) * np.exp(rng.normal(0, 0.1)) + 0.5
+    if rng.random() < 0.25:  # soft lenses; and a renderer's noise should not give drops away
+        image = cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.4, 1.1)))
     if rng.random() < 0.5:
-        image = image + rng.normal(0, rng.uniform(0, 0.02), image.shape)
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        image = image + np.float32(rng.uniform(0, 0.03)) * noise
     return np.clip(image, 0, 1).astype(np.float32)

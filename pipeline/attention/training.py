@@ -1,27 +1,27 @@
-"""Fits the attentive-recurrent network to pools of rainy pictures with known coverage."""
+"""Fits a detector to pools of rainy pictures with known coverage."""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from pipeline.attention.muon import Muon
-from pipeline.attention.network import (
-    FEATURES,
-    AttentiveRecurrentNet,
-    bias_of,
-    first_layer,
-    last_layer,
-)
-from pipeline.attention.samples import MAP_THRESHOLD, VISIBLE_COVERAGE, Pool, draw_batch, wetness
+from pipeline.attention.network import AttentiveRecurrentNet
+from pipeline.attention.samples import VISIBLE_COVERAGE, Pool, draw_batch, wetness
+from pipeline.attention.unet import DropUNet
+from pipeline.attention.weights import Detector
 
 THETA = 0.8
+# Columns of the validation curve; see `curve_rows`.
+CURVE = ("iteration", "steps", "loss", "set", "threshold", "precision", "recall", "f1", "iou")
 EMA_DECAY = 0.995
 
 
@@ -41,89 +41,59 @@ class Phase:
 
 @dataclass(frozen=True)
 class Score:
-    """The network against true coverage > 0.05, its map cut at 0.3; all in [0,1]."""
+    """A detector against true coverage > 0.05, its maps cut at `threshold`; all in [0,1]."""
 
-    mse: float
+    threshold: float
     precision: float
     recall: float
     f1: float
+    iou: float
 
 
-def attention_loss(maps: Sequence[Tensor], target: Tensor, theta: float = THETA) -> Tensor:
+def attention_loss(
+    maps: Sequence[Tensor], target: Tensor, weight: Tensor | None = None, theta: float = THETA
+) -> Tensor:
     """The paper's loss over the N steps: sum of theta^(N-t) MSE(A_t, M), t = 1..N.
 
-    maps: N raw maps (B,1,H,W); target: the same shape. Source: Qian et al., CVPR 2018, eq. 3.
+    maps: N raw maps (B,1,H,W); target and the pixels' weight: the same shape.
+    Source: Qian et al., CVPR 2018, eq. 3.
     """
     total = torch.zeros((), device=target.device)
+    share = torch.ones_like(target) if weight is None else weight
     for step, found in enumerate(maps, start=1):
-        total = total + theta ** (len(maps) - step) * (found - target).square().mean()
+        error = ((found - target).square() * share).mean()
+        total = total + theta ** (len(maps) - step) * error
     return total
 
 
-def initialise(network: AttentiveRecurrentNet, seed: int) -> None:
-    """Draws starting weights from which a few minutes of training get somewhere.
+def overlap_loss(log_odds: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Binary cross-entropy of a soft target plus one minus the soft Dice coefficient.
 
-    The first layer reads differences (each of its kernels sums to zero over the photo) four
-    times as strongly as usual, because drops show in contrast, not in brightness. The gates
-    start open and, like the residual branches, quiet, so that nothing is saturated. From plain
-    starting values nothing was learnt in the same time.
+    All (B,1,H,W). The Dice coefficient has squares below the line (Milletari et al., 3DV 2016), so
+    that it, too, is best at the soft target itself.
     """
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for module in network.modules():
-            if isinstance(module, nn.Conv2d):
-                deviation = math.sqrt(2 / module.weight[0].numel())
-                module.weight.normal_(0, deviation, generator=generator)
-                bias_of(module).zero_()
-        first = first_layer(network.det_conv0).weight
-        first[:, :3] -= first[:, :3].mean((2, 3), keepdim=True)
-        first[:, :3] *= 4
-        first[:, 3:] *= 0.1
-        for block in network.residual_blocks():
-            last_layer(block).weight *= 0.3
-        for gate in (network.conv_i, network.conv_f, network.conv_g, network.conv_o):
-            first_layer(gate).weight *= 0.5
-        bias_of(first_layer(network.conv_i)).fill_(1)
-        bias_of(first_layer(network.conv_o)).fill_(1)
-        last = first_layer(network.det_conv_mask)
-        last.weight *= 0.3
-        bias_of(last).fill_(0.2)
-
-
-def unroll(network: AttentiveRecurrentNet) -> None:
-    """Prepares weights that were trained with one step for several, keeping what they compute.
-
-    At one step the map is a constant 0.5 and the state zero. The constant is absorbed into the
-    first layer's bias, the weights that read map and hidden state become zero, and the forget
-    gate is nearly closed: every further step then repeats the first one (but for what the
-    closed gate lets through), and training goes on from there instead of unlearning.
-    """
-    gates = (network.conv_i, network.conv_f, network.conv_g, network.conv_o)
-    with torch.no_grad():
-        first, forget = first_layer(network.det_conv0), first_layer(network.conv_f)
-        bias_of(first).add_(0.5 * first.weight[:, 3].sum((1, 2)))
-        first.weight[:, 3].zero_()
-        for gate in gates:
-            first_layer(gate).weight[:, FEATURES:].zero_()
-        forget.weight.mul_(0.1)
-        bias_of(forget).fill_(-3)
+    entropy = F.binary_cross_entropy_with_logits(log_odds, target, weight)
+    found = torch.sigmoid(log_odds)
+    both = 2 * (weight * found * target).sum() + 1
+    return entropy + 1 - both / ((weight * (found.square() + target.square())).sum() + 1)
 
 
 class Trainer:
     """A fit under way: the network, its running average, its optimisers and how far it is.
 
     Every crop is drawn from a generator seeded with (seed, phase, iteration), so a fit that was
-    interrupted and goes on from `state()` ends like one that was not.
+    interrupted and goes on from `state()` ends like one that was not. bfloat16: products in half
+    precision, about twice as fast where the processor knows it.
     """
 
     def __init__(
-        self, network: AttentiveRecurrentNet, pools: Sequence[Pool], phases: Sequence[Phase],
-        *, seed: int, clean_share: float,
+        self, network: Detector, pools: Sequence[Pool], phases: Sequence[Phase],
+        *, seed: int, clean_share: float, bfloat16: bool = False,
     ) -> None:  # fmt: skip
         self.network, self.pools, self.phases = network, pools, phases
-        self.seed, self.clean_share = seed, clean_share
+        self.seed, self.clean_share, self.bfloat16 = seed, clean_share, bfloat16
         self.phase = self.iteration = self.seen = self.done = 0
-        self.average = AttentiveRecurrentNet().to(next(network.parameters()).device)
+        self.average = copy.deepcopy(network).eval()
         self._begin_phase()
 
     def _begin_phase(self) -> None:
@@ -131,7 +101,8 @@ class Trainer:
         if self.seen:
             self.network.load_state_dict(self.average.state_dict())
         if self.phase < len(self.phases) and self._was_single_step():
-            unroll(self.network)
+            assert isinstance(self.network, AttentiveRecurrentNet)
+            self.network.unroll()
         self.average.load_state_dict(self.network.state_dict())
         self.seen = 0
         matrices = [p for n, p in self.network.named_parameters() if _is_matrix(n, p)]
@@ -146,6 +117,11 @@ class Trainer:
         )
 
     @property
+    def total(self) -> int:
+        """The iterations of all phases."""
+        return sum(phase.iterations for phase in self.phases)
+
+    @property
     def finished(self) -> bool:
         return self.phase >= len(self.phases)
 
@@ -153,10 +129,9 @@ class Trainer:
         """One iteration; its loss."""
         phase = self.phases[self.phase]
         rng = np.random.default_rng([self.seed, self.phase, self.iteration])
-        device = next(self.network.parameters()).device
-        images, coverage = draw_batch(self.pools, rng, phase.batch, phase.crop, self.clean_share)
-        target = wetness(coverage.to(device))
-        loss = attention_loss(self.network(images.to(device), phase.steps), target)
+        drawn = draw_batch(self.pools, rng, phase.batch, phase.crop, self.clean_share)
+        self.network.train()
+        loss = self._loss(*drawn, phase.steps)
         for optimiser in self.optimisers:
             optimiser.zero_grad()
         loss.backward()
@@ -168,6 +143,20 @@ class Trainer:
             self._begin_phase()
         return float(loss.detach())
 
+    def _loss(self, images: Tensor, coverage: Tensor, weight: Tensor, steps: int) -> Tensor:
+        device = next(self.network.parameters()).device
+        images = images.to(device, memory_format=torch.channels_last)
+        target, weight = wetness(coverage.to(device)), weight.to(device)
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16):
+            if isinstance(self.network, DropUNet):
+                found = [self.network(images)]
+            else:
+                found = self.network(images, steps)
+        found = [each.float() for each in found]
+        if isinstance(self.network, DropUNet):
+            return overlap_loss(found[0], target, weight)
+        return attention_loss(found, target, weight)
+
     def _apply(self, phase: Phase) -> None:
         warm = min(1.0, (self.iteration + 1) / 20)
         progress = self.iteration / phase.iterations
@@ -178,9 +167,11 @@ class Trainer:
             optimiser.step()
         self.seen += 1
         decay = min(EMA_DECAY, self.seen / (self.seen + 10))
+        new = self.network.state_dict()
         with torch.no_grad():
-            for kept, new in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                kept.lerp_(new, 1 - decay)
+            for name, kept in self.average.state_dict().items():
+                if kept.is_floating_point():
+                    kept.lerp_(new[name], 1 - decay)
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs to go on from here: tensors and numbers."""
@@ -201,55 +192,84 @@ class Trainer:
 
 
 def _is_matrix(name: str, parameter: Tensor) -> bool:
-    """Muon takes the hidden convolutions; Adam the map's single row and all biases."""
-    return parameter.ndim == 4 and not name.startswith("det_conv_mask")
+    """Muon takes the hidden convolutions; Adam the map's single row and all vectors."""
+    return parameter.ndim == 4 and not name.startswith(("det_conv_mask", "last"))
 
 
-def score(network: AttentiveRecurrentNet, pool: Pool, steps: int) -> Score:
-    """How well the network finds the water of a pool it was not trained on.
+THRESHOLDS = np.arange(2, 20) / 20
 
-    All pixels of all pictures are counted together.
+
+def score(network: Detector, pool: Pool, steps: int) -> Score:
+    """How well the network finds the water of a pool it was not trained on, at its best threshold.
+
+    All pixels of all pictures are counted together; thresholds are tried in steps of 0.05.
     """
     device = next(network.parameters()).device
-    squares = pixels = hits = marked = wet = 0.0
+    counts = np.zeros((3, len(THRESHOLDS)))  # hits, marked, wet
     for rainy, cover in zip(pool.rainy, pool.coverage, strict=True):
         bgr = np.ascontiguousarray(rainy[..., ::-1].transpose(2, 0, 1), np.float32) / 255
         with torch.inference_mode():
-            raw = network(torch.from_numpy(bgr)[None].to(device), steps)[-1][0, 0]
-        found = raw.cpu().clamp(0, 1)
-        coverage = torch.from_numpy(cover.astype(np.float32) / 255)
-        squares += float((found - wetness(coverage)).square().sum())
-        pixels += cover.size
-        marks, true = found > MAP_THRESHOLD, coverage > VISIBLE_COVERAGE
-        hits += float((marks & true).sum())
-        marked += float(marks.sum())
-        wet += float(true.sum())
-    return Score(
-        mse=squares / max(pixels, 1),
-        precision=hits / max(marked, 1),
-        recall=hits / max(wet, 1),
-        f1=2 * hits / max(marked + wet, 1),
-    )
+            found = network.attention(torch.from_numpy(bgr)[None].to(device), steps)
+        counts += count(found[0, 0].cpu().numpy(), cover / 255 > VISIBLE_COVERAGE)
+    return scores(counts)[int(np.argmax([each.f1 for each in scores(counts)]))]
+
+
+def count(found: np.ndarray, wet: np.ndarray) -> np.ndarray:
+    """(3, thresholds): pixels marked and wet, marked, wet, at each of THRESHOLDS.
+
+    found: map (H,W) in [0,1]; wet: (H,W) bool. Counts of several pictures add up.
+    """
+    hits = [int((wet & (found > threshold)).sum()) for threshold in THRESHOLDS]
+    marked = [int((found > threshold).sum()) for threshold in THRESHOLDS]
+    return np.array([hits, marked, [int(wet.sum())] * len(THRESHOLDS)], float)
+
+
+def scores(counts: np.ndarray) -> list[Score]:
+    """The score at each of THRESHOLDS, from `count`."""
+    return [
+        Score(
+            threshold=float(threshold),
+            precision=hits / max(marked, 1),
+            recall=hits / max(wet, 1),
+            f1=2 * hits / max(marked + wet, 1),
+            iou=hits / max(marked + wet - hits, 1),
+        )
+        for threshold, (hits, marked, wet) in zip(THRESHOLDS, counts.T, strict=True)
+    ]
+
+
+def curve_rows(
+    done: int, steps: int, loss: float, found: Mapping[str, Score]
+) -> list[list[float | str]]:
+    """Rows of the validation curve, one per set of pictures; columns: CURVE."""
+    rows: list[list[float | str]] = []
+    for name, each in found.items():
+        figures = (each.threshold, each.precision, each.recall, each.f1, each.iou)
+        rows.append([done, steps, round(loss, 6), name, *(round(f, 4) for f in figures)])
+    return rows
 
 
 def fit(
     trainer: Trainer,
     *,
     validate_every: int,
-    validation: Pool,
-    on_score: Callable[[int, int, float, Score], None],
-) -> AttentiveRecurrentNet:
+    validation: Mapping[str, Pool],
+    on_score: Callable[[int, int, float, dict[str, Score]], None],
+) -> Detector:
     """The running average of the weights after all phases.
 
-    on_score(iterations done, recurrent steps, mean loss since the last call, score) is called
-    every `validate_every` iterations and at the end of each phase: there a checkpoint is written.
+    on_score(iterations done, recurrent steps, mean loss since the last call, score per validation
+    pool) is called every `validate_every` iterations and at the end of each phase: there a
+    checkpoint is written.
     """
     losses: list[float] = []
     while not trainer.finished:
         steps = trainer.phases[trainer.phase].steps
         losses.append(trainer.advance())
         if trainer.iteration % validate_every == 0:  # 0 after the last one of a phase, too
-            result = score(trainer.average, validation, steps)
+            result = {
+                name: score(trainer.average, pool, steps) for name, pool in validation.items()
+            }
             on_score(trainer.done, steps, float(np.mean(losses)), result)
             losses = []
     return trainer.average

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +23,25 @@ def sample_pair(
     alpha of the composition; with probability clean_share there is no water and it is all zero,
     while the image still goes through glass, noise and compression.
     """
+    rainy, _, coverage = sample_shots(rng, background, clean_share=clean_share)
+    return rainy, coverage
+
+
+def sample_shots(
+    rng: np.random.Generator, background: Image, *, clean_share: float = CLEAN_SHARE
+) -> tuple[Image, Image, NDArray[np.float32]]:
+    """The pair of `sample_pair` with, in its middle, the same photo without the drops.
+
+    Both photos are taken through the same pane by the same camera with the same noise, so that
+    they differ where the water shows and nowhere else (but for what compression does).
+    """
     height, width = background.shape[:2]
-    image = through_glass(rng, background)
-    coverage = np.zeros((height, width), np.float32)
+    dry = through_glass(rng, background)
+    wet, coverage = dry, np.zeros((height, width), np.float32)
     if rng.random() >= clean_share:
-        image, coverage = _wet(rng, image)
-    return through_camera(rng, image), coverage
+        wet, coverage = _wet(rng, dry)
+    clean = through_camera(copy.deepcopy(rng), dry)
+    return through_camera(rng, wet), clean, coverage
 
 
 def _wet(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.float32]]:
@@ -67,7 +82,8 @@ def _wet(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.floa
         pane_distance=focal,  # one metre per pixel: only angles matter here
         aperture_radius=blur / 2,
         highlight=float(rng.uniform(0.0, 5.0)),
-        sky_gain=float(np.exp(rng.uniform(np.log(0.7), np.log(4.0)))),
+        # Most drops gather light from above the photo: before dark things they look white.
+        sky_gain=float(np.exp(rng.uniform(np.log(0.7), np.log(6.0)))),
         rim_light=float(rng.uniform(0.15, 0.7)),
         surroundings=_surroundings(rng),
     )

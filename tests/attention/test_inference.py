@@ -8,13 +8,12 @@ import torch
 
 from pipeline.attention.inference import attend
 from pipeline.attention.network import AttentiveRecurrentNet
-from pipeline.attention.training import initialise
 
 
 @pytest.fixture
 def network() -> AttentiveRecurrentNet:
     made = AttentiveRecurrentNet().eval()
-    initialise(made, seed=5)
+    made.initialise(seed=5)
     return made
 
 

@@ -10,13 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.attention.network import (
-    AttentiveRecurrentNet,
-    bgr_from_rgb,
-    load_network,
-    network_from_state,
-)
-from pipeline.attention.training import initialise, unroll
+from pipeline.attention.network import AttentiveRecurrentNet, bgr_from_rgb
+from pipeline.attention.unet import DropUNet
+from pipeline.attention.weights import load_network, network_from_state, save_network
 from pipeline.errors import UserError
 from pipeline.io.tensors import save_tensors
 
@@ -31,7 +27,7 @@ SHAPES = {
 @pytest.fixture
 def network() -> AttentiveRecurrentNet:
     made = AttentiveRecurrentNet().eval()
-    initialise(made, seed=3)
+    made.initialise(seed=3)
     return made
 
 
@@ -87,7 +83,7 @@ def test_unrolling_keeps_what_one_step_computed(network: AttentiveRecurrentNet) 
     bgr = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         before = network(bgr, 1)[-1]
-        unroll(network)
+        network.unroll()
         after = network(bgr, 4)
     inside = (..., slice(13, -13), slice(13, -13))
     torch.testing.assert_close(after[0][inside], before[inside], atol=1e-5, rtol=1e-4)
@@ -122,7 +118,27 @@ def test_missing_and_misshapen_tensors_are_named(network: AttentiveRecurrentNet)
 def test_safetensors_round_trip(network: AttentiveRecurrentNet, tmp_path: Path) -> None:
     save_tensors(tmp_path / "w.safetensors", network.state_dict())
     loaded = load_network(tmp_path / "w.safetensors")
+    assert isinstance(loaded, AttentiveRecurrentNet)
     assert torch.equal(loaded.conv_g[0].weight, network.conv_g[0].weight)
+
+
+def test_a_file_says_which_network_it_is_for(
+    network: AttentiveRecurrentNet, tmp_path: Path
+) -> None:
+    unet = DropUNet().eval()
+    unet.initialise(1)
+    for name, made in (("attentive", network), ("unet", unet)):
+        save_network(tmp_path / f"{name}.safetensors", made)
+    back = load_network(tmp_path / "unet.safetensors", "unet")
+    for name, value in back.state_dict().items():
+        assert torch.equal(value, unet.state_dict()[name])
+    for file, model in (("attentive", "unet"), ("unet", "attentive")):
+        with pytest.raises(UserError, match=f"for the detector '{file}', not for '{model}'"):
+            load_network(tmp_path / f"{file}.safetensors", model)
+    # Files of before say nothing; the tensors do.
+    save_tensors(tmp_path / "old.safetensors", network.state_dict())
+    with pytest.raises(UserError, match=r"down\.0\.conv1\.weight is missing"):
+        load_network(tmp_path / "old.safetensors", "unet")
 
 
 class _Harmful:

@@ -11,10 +11,21 @@ import torch
 
 from pipeline.attention.inference import attend
 from pipeline.attention.muon import orthogonalised
-from pipeline.attention.network import AttentiveRecurrentNet, load_network
+from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.attention.pools import read_photo_pairs, read_rendered
-from pipeline.attention.samples import Pool, coverage_of_pair, draw_batch, wetness
-from pipeline.attention.training import Phase, Trainer, attention_loss, initialise, score
+from pipeline.attention.samples import Pool, coverage_of_pair, draw_batch, visibility, wetness
+from pipeline.attention.training import (
+    THRESHOLDS,
+    Phase,
+    Trainer,
+    attention_loss,
+    count,
+    overlap_loss,
+    score,
+    scores,
+)
+from pipeline.attention.unet import DropUNet
+from pipeline.attention.weights import load_network
 from pipeline.errors import UserError
 from pipeline.io.images import write_image
 
@@ -48,9 +59,30 @@ def test_attention_loss_by_hand() -> None:
     assert attention_loss(maps[:1], target).item() == pytest.approx(1.0)
 
 
-def test_wetness_puts_visible_water_at_the_threshold() -> None:
-    coverage = torch.tensor([0.0, 0.05, 0.1, 1 / 6, 0.5, 1.0])
-    assert torch.allclose(wetness(coverage), torch.tensor([0.0, 0.3, 0.6, 1.0, 1.0, 1.0]))
+def test_wetness_is_the_root_of_coverage() -> None:
+    coverage = torch.tensor([0.0, 0.04, 0.25, 1.0])
+    assert torch.allclose(wetness(coverage), torch.tensor([0.0, 0.2, 0.5, 1.0]))
+
+
+def test_overlap_loss_by_hand_and_best_at_the_target() -> None:
+    target = torch.tensor([[[[1.0, 0.0]]]])
+    weight = torch.tensor([[[[1.0, 0.5]]]])
+    # Map 0.5 everywhere: entropy ln 2 times the mean weight; Dice (2*0.5 + 1) / (1.25 + 0.125 + 1).
+    found = overlap_loss(torch.zeros(1, 1, 1, 2), target, weight)
+    assert found.item() == pytest.approx(0.75 * np.log(2) + 1 - 2 / 2.375, abs=1e-6)
+    soft = torch.tensor([[[[0.3, 0.8]]]])
+    losses = [overlap_loss(torch.logit(soft + d), soft, weight).item() for d in (-0.1, 0, 0.1)]
+    assert losses[1] < min(losses[0], losses[2])
+
+
+def test_water_that_changes_nothing_weighs_little() -> None:
+    clean = np.full((24, 24, 3), 0.5, np.float32)
+    rainy, coverage = clean.copy(), np.zeros((24, 24), np.float32)
+    coverage[:, :12] = 0.5
+    rainy[:8, :12] += 0.2
+    weight = visibility(rainy, clean, coverage)
+    assert (weight[:7, :11] == 1).all() and (weight[:, 12:] == 1).all()
+    assert np.allclose(weight[12:, :12], 0.1)
 
 
 def test_coverage_of_a_photo_pair_is_where_it_differs() -> None:
@@ -77,18 +109,26 @@ def test_batches_are_bgr_in_range_and_repeatable() -> None:
     first, second = (
         draw_batch([pool], np.random.default_rng(4), 5, 32, clean_share=0.2) for _ in range(2)
     )
-    assert first[0].shape == (5, 3, 32, 32) and first[1].shape == (5, 1, 32, 32)
+    assert first[0].shape == (5, 3, 32, 32)
+    assert first[1].shape == first[2].shape == (5, 1, 32, 32)
     assert all(t.min() >= 0 and t.max() <= 1 for t in first)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
-    dry, cover = draw_batch([pool], np.random.default_rng(4), 5, 32, clean_share=1.0)
+    dry, cover, _ = draw_batch([pool], np.random.default_rng(4), 5, 32, clean_share=1.0)
     assert cover.max() == 0 and dry.std() > 0.05
 
 
-def _train(iterations: list[int], resume_at: int | None = None) -> tuple[list[float], Trainer]:
+def _train(
+    make: type[AttentiveRecurrentNet] | type[DropUNet],
+    iterations: list[int],
+    resume_at: int | None = None,
+) -> tuple[list[float], Trainer]:
     def fresh() -> Trainer:
-        network = AttentiveRecurrentNet()
-        initialise(network, 0)
-        phases = [Phase(k + 1, n, 4, 32, 0.02) for k, n in enumerate(iterations)]
+        network = make()
+        network.initialise(0)
+        attentive = make is AttentiveRecurrentNet
+        phases = [
+            Phase(k + 1 if attentive else 1, n, 4, 32, 0.02) for k, n in enumerate(iterations)
+        ]
         return Trainer(network, [_pool()], phases, seed=1, clean_share=0.1)
 
     trainer, losses = fresh(), []
@@ -100,20 +140,37 @@ def _train(iterations: list[int], resume_at: int | None = None) -> tuple[list[fl
     return losses, trainer
 
 
-def test_twenty_steps_learn() -> None:
+@pytest.mark.parametrize("make", [AttentiveRecurrentNet, DropUNet])
+def test_some_steps_learn(make: type[AttentiveRecurrentNet] | type[DropUNet]) -> None:
+    losses, trainer = _train(make, [25])
+    assert len(losses) == 25
+    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
+    before = make().eval()
+    before.initialise(0)
     pool = _pool()
-    before = AttentiveRecurrentNet()
-    initialise(before, 0)
-    losses, trainer = _train([20])
-    assert len(losses) == 20
-    assert score(trainer.average, pool, 1).mse < 0.95 * score(before, pool, 1).mse
+    assert score(trainer.average, pool, 1).f1 > score(before, pool, 1).f1 + 0.05
 
 
-def test_an_interrupted_fit_ends_like_one_that_was_not() -> None:
-    (whole, one), (parts, two) = _train([4, 3]), _train([4, 3], resume_at=3)
+@pytest.mark.parametrize("make", [AttentiveRecurrentNet, DropUNet])
+def test_an_interrupted_fit_ends_like_one_that_was_not(
+    make: type[AttentiveRecurrentNet] | type[DropUNet],
+) -> None:
+    (whole, one), (parts, two) = _train(make, [4, 3]), _train(make, [4, 3], resume_at=3)
     assert whole == parts
-    for a, b in zip(one.average.parameters(), two.average.parameters(), strict=True):
+    for a, b in zip(
+        one.average.state_dict().values(), two.average.state_dict().values(), strict=True
+    ):
         assert torch.equal(a, b)
+
+
+def test_half_precision_trains_too() -> None:
+    network = DropUNet()
+    network.initialise(0)
+    phases = [Phase(1, 2, 2, 32, 0.02)]
+    trainer = Trainer(network, [_pool()], phases, seed=1, clean_share=0.1, bfloat16=True)
+    losses = [trainer.advance(), trainer.advance()]
+    assert np.isfinite(losses).all()
+    assert all(p.dtype == torch.float32 for p in trainer.average.parameters())
 
 
 def test_score_of_a_network_that_marks_everything() -> None:
@@ -126,6 +183,16 @@ def test_score_of_a_network_that_marks_everything() -> None:
     result = score(network, pool, 1)
     assert result.recall == 1 and result.precision == pytest.approx(wet, abs=1e-6)
     assert result.f1 == pytest.approx(2 * wet / (1 + wet), abs=1e-6)
+    assert result.iou == pytest.approx(wet, abs=1e-6)
+
+
+def test_scores_at_each_threshold_by_hand() -> None:
+    found = np.array([[0.9, 0.4], [0.4, 0.0]])
+    wet = np.array([[True, True], [False, False]])
+    low, high = (scores(count(found, wet))[list(THRESHOLDS).index(t)] for t in (0.3, 0.5))
+    assert (low.precision, low.recall) == (pytest.approx(2 / 3), 1)
+    assert (low.f1, low.iou) == (pytest.approx(0.8), pytest.approx(2 / 3))
+    assert (high.precision, high.recall, high.iou) == (1, 0.5, 0.5)
 
 
 def test_folders_of_pairs(tmp_path: Path) -> None:

@@ -1,0 +1,91 @@
+"""Fetches the clean photographs that the shipped weights were trained on, from Debian packages.
+
+`python -m experiments.detector.photos OUT` writes OUT/train and OUT/unseen (kept for scoring), JPEG,
+longest side 1600. They are pictures of Debian's main archive, whose licences allow all uses of the
+project; they are not part of it. Needs a Debian machine (`apt-get download`, `dpkg-deb`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import tempfile
+from pathlib import Path
+
+import cv2
+
+BACKGROUNDS = "usr/share/backgrounds"
+PLASMA = "usr/share/wallpapers/{}/contents/images/2560x1600.jpg"
+OPENCV = "usr/share/doc/opencv-doc/examples"
+# Which pictures of which package; the names are paths inside it, without their common beginning.
+PHOTOS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "lomiri-wallpapers-16.04": (BACKGROUNDS, (
+        "Bridge_by_Sander_Klootwijk.jpg", "Dragonfly_by_Bolly.jpg", "Picture_1A_by_freespace.jpg",
+        "Wine_by_Jakkub_Mede.jpg", "aitzgorri_by_Aitzol_Berasategi.jpg", "free_by_Peter_Nerlich.jpg",
+        "friends_by_Aitzol_Berasategi.jpg", "greentock_by_Peter_Nerlich.jpg",
+        "life_by_Aitzol_Berasategi.jpg", "picosdeeuropa_by_Aitzol_Berasategi.jpg",
+        "seeding_by_Clements_Engelhardt.jpg", "sunset_by_Aitzol_Berasategi.jpg",
+    )),
+    "lomiri-wallpapers-20.04": (BACKGROUNDS, ("Kleiber_by_Lukas_Baubkus.jpg",)),
+    "mate-backgrounds": (f"{BACKGROUNDS}/mate/nature", (
+        "Dune.jpg", "FreshFlower.jpg", "Garden.jpg", "GreenMeadow.jpg", "LadyBird.jpg", "Storm.jpg",
+        "TwoWings.jpg", "Wood.jpg", "YellowFlower.jpg",
+    )),
+    "plasma-workspace-wallpapers": ("", tuple(PLASMA.format(name) for name in (
+        "BytheWater", "ColorfulCups", "EveningGlow", "FallenLeaf", "Kite", "OneStandsOut",
+        "DarkestHour", "Path", "summer_1am", "Grey",
+    ))),
+    "opencv-doc": (OPENCV, (
+        "alphamat/input_images/plant.jpg", "data/aero1.jpg", "data/aloeL.jpg", "data/board.jpg",
+        "data/building.jpg", "data/butterfly.jpg", "data/chicky_512.png", "data/fruits.jpg",
+        "data/graf1.png", "data/home.jpg", "data/left.jpg", "data/leuvenA.jpg",
+        "data/rubberwhale1.png", "data/smarties.png", "data/squirrel_cls.jpg", "data/stuff.jpg",
+        "data/apple.jpg", "data/licenseplate_motion.jpg",
+        "text/scenetext01.jpg", "text/scenetext02.jpg", "text/scenetext03.jpg",
+        "text/scenetext04.jpg", "text/scenetext05.jpg", "text/scenetext06.jpg",
+        "text/scenetext_segmented_word01.jpg", "text/scenetext_segmented_word02.jpg",
+        "text/scenetext_segmented_word03.jpg", "text/scenetext_segmented_word04.jpg",
+        "text/scenetext_segmented_word05.jpg",
+    )),
+}  # fmt: skip
+# Never trained on: a street, a house, signs, a lawn with a barrier, mountains, an animal, a forest.
+UNSEEN = ("leuvenA", "home", "scenetext01", "scenetext05", "picosdeeuropa_by_Aitzol_Berasategi",
+          "squirrel_cls", "summer_1am", "Garden")  # fmt: skip
+LONGEST = 1600
+
+
+def fetch(out: Path) -> None:
+    """Downloads the packages and writes their photographs."""
+    for package, (beginning, names) in PHOTOS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            subprocess.run(["apt-get", "download", package], cwd=folder, check=True)
+            (archive,) = Path(folder).glob("*.deb")
+            subprocess.run(["dpkg-deb", "-x", archive, folder], check=True)
+            for name in names:
+                _keep(Path(folder) / beginning / name, package, out)
+
+
+def _keep(source: Path, package: str, out: Path) -> None:
+    photo = cv2.imread(str(source))
+    if photo is None:
+        raise SystemExit(f"{package} no longer holds {source.name}.")
+    # The wallpapers of one package are all called by their size.
+    stem = source.parts[-4] if source.stem[0].isdigit() else source.stem
+    factor = LONGEST / max(photo.shape[:2])
+    if factor < 1:
+        photo = cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    target = out / ("unseen" if stem in UNSEEN else "train") / f"{stem}.jpg"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(target), photo, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    print(f"{package}: {target}")
+
+
+def main() -> None:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path)
+    fetch(parser.parse_args().out)
+
+
+if __name__ == "__main__":
+    main()
