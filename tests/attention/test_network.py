@@ -12,7 +12,7 @@ import torch
 
 from pipeline.attention.network import AttentiveRecurrentNet, bgr_from_rgb
 from pipeline.attention.unet import DropUNet
-from pipeline.attention.weights import load_network, network_from_state, save_network
+from pipeline.attention.weights import load_network, save_network
 from pipeline.errors import UserError
 from pipeline.io.tensors import save_tensors
 
@@ -104,13 +104,16 @@ def test_a_full_generator_fits_and_extra_tensors_are_ignored(
         assert torch.equal(value, network.state_dict()[name])
 
 
-def test_missing_and_misshapen_tensors_are_named(network: AttentiveRecurrentNet) -> None:
+def test_missing_and_misshapen_tensors_are_named(
+    network: AttentiveRecurrentNet, tmp_path: Path
+) -> None:
     state = dict(network.state_dict())
     del state["conv_f.0.bias"]
     state["det_conv0.0.weight"] = torch.zeros(32, 3, 3, 3)
     state["det_conv_mask.0.bias"] = torch.tensor([float("nan")])
+    torch.save(state, tmp_path / "w.pt")
     with pytest.raises(UserError) as caught:
-        network_from_state(state, "weights.pt")
+        load_network(tmp_path / "w.pt")
     for part in ("conv_f.0.bias is missing", "det_conv0.0.weight is (32, 3, 3, 3)", "not finite"):
         assert part in caught.value.what
 
