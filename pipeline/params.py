@@ -64,6 +64,39 @@ def read_params(file: Path) -> dict[str, Any]:
     return content
 
 
+def with_scene(file: Path, scene: str) -> str | None:
+    """The text of params.yaml with `scene` added under `scenes`, all else as it is; None if it is there.
+
+    UserError when the file cannot be edited line by line, with the line to add by hand.
+    """
+    content = read_params(file)
+    if scene in (content.get("scenes") or {}):
+        return None
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    entry = f"  {scene}: {{<<: *scene}}\n"
+    start = next((i for i, line in enumerate(lines) if line.split("#")[0].strip() == "scenes:"), -1)
+    if start >= 0:
+        end = start + 1
+        for index in range(start + 1, len(lines)):
+            if lines[index].strip() and not lines[index].startswith((" ", "#")):
+                break
+            if lines[index].startswith(" ") and not lines[index].lstrip().startswith("#"):
+                end = index + 1
+        before = "".join(lines[:end])
+        text = before + ("" if before.endswith("\n") else "\n") + entry + "".join(lines[end:])
+        try:
+            edited = YAML(typ="safe").load(text)
+            anchored = edited["scenes"].pop(scene)
+        except (YAMLError, TypeError, KeyError):
+            edited = anchored = None
+        if edited == {**content, "scenes": content.get("scenes") or {}} and anchored is not None:
+            return text
+    raise UserError(
+        f"{file}: the scene {scene} could not be added.",
+        f"Write it under scenes: by hand, as `{entry.strip()}`.",
+    )
+
+
 def stage_names() -> list[str]:
     """The names of all stages, which are the names of their sections."""
     return sorted(path.stem for path in STAGES.glob("*.py") if path.stem != "__init__")

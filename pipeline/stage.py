@@ -8,7 +8,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -73,16 +73,31 @@ class _AboveProgressBars(logging.Handler):
         tqdm.write(self.format(record), file=sys.stderr)
 
 
-def run(name: str, params_type: type[P], main: Callable[[Job, P], str | None]) -> NoReturn:
+def run(
+    name: str,
+    params_type: type[P],
+    main: Callable[[Job, P], str | None],
+    *,
+    add_flags: Callable[[argparse.ArgumentParser], None] | None = None,
+    before: Callable[[Path, argparse.Namespace], None] | None = None,
+) -> NoReturn:
     """Runs stage `name` and leaves the process.
 
     Exit codes: 0 done; 2 a fault the user can mend, told in one sentence; 1 a bug, with its traceback;
-    130 interrupted; 143 terminated. `main` returns the closing sentence, or None.
+    130 interrupted; 143 terminated. `main` returns the closing sentence, or None. `add_flags` and
+    `before` (which gets the path of params.yaml) serve what comes before the parameters are read.
     """
     signal.signal(signal.SIGTERM, _terminate)
     _die_with_dvc()
     try:
-        sys.exit(_run(name, params_type, main, sys.argv[1:]))
+        parser = _parser(name)
+        if add_flags is not None:
+            add_flags(parser)
+        flags = parser.parse_args(sys.argv[1:])
+        params_file = _params_file(flags.params)
+        if before is not None:
+            before(params_file, flags)
+        sys.exit(_run(name, params_type, main, params_file, flags))
     except UserError as error:
         print(f"{name}: {error.what}", file=sys.stderr)
         if error.hint:
@@ -94,10 +109,12 @@ def run(name: str, params_type: type[P], main: Callable[[Job, P], str | None]) -
 
 
 def _run(
-    name: str, params_type: type[P], main: Callable[[Job, P], str | None], argv: Sequence[str]
+    name: str,
+    params_type: type[P],
+    main: Callable[[Job, P], str | None],
+    params_file: Path,
+    flags: argparse.Namespace,
 ) -> int:
-    flags = _parser(name).parse_args(argv)
-    params_file = _params_file(flags.params)
     job = Job(
         params_file.parent, flags.scene, flags.variant, flags.device, flags.scheduler, flags.verbose
     )

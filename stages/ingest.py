@@ -1,19 +1,42 @@
-"""Photos in, images of one size out: upright 8-bit RGB PNG, their sources, focal lengths and split."""
+"""A capture in, images of one size out: upright 8-bit RGB PNG, their sources, focal lengths and split."""
 
 from __future__ import annotations
 
+import argparse
 import logging
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.io.atomic import publish_dir
-from pipeline.io.photos import Photo, common_turns, convert, examine, list_photos
-from pipeline.io.scene import ImageRecord, write_images_json
+from pipeline.io.atomic import publish_dir, write_text
+from pipeline.io.capture import Capture, adopt, find_capture
+from pipeline.io.frames import save_frames
+from pipeline.io.intake import (
+    given_turns,
+    given_views,
+    masks_said,
+    straighteners,
+    write_given_masks,
+)  # fmt: skip
+from pipeline.io.paths import ScenePaths
+from pipeline.io.photos import convert, examine, final_size, plan_sizes
+from pipeline.io.scene import (
+    GIVEN_MASKS,
+    GIVEN_POSES,
+    ImageRecord,
+    Origin,
+    with_split,
+    write_images_json,
+)
+from pipeline.io.transforms import write_transforms
 from pipeline.parallel import map_named
+from pipeline.params import with_scene
+from pipeline.sfm import read_colmap
 from pipeline.stage import Job, Section, run
 
 log = logging.getLogger(__name__)
+FEWEST = 3
 
 
 class Params(Section):
@@ -24,55 +47,82 @@ class Params(Section):
     holdout: Annotated[
         int, Field(ge=0, description="every n-th image is held out; 0 holds out none")
     ]
+    frames: Annotated[int, Field(ge=3, le=2000)]
+    mixed_sizes: Literal["scale", "refuse"]
 
 
 def main(job: Job, params: Params) -> str:
     """Brings `data/<scene>/` into `artifacts/<scene>/images/`."""
-    sources = list_photos(job.paths.data, params.min_images)
+    capture = find_capture(job.paths.data, params.min_images, read_colmap)
+    with publish_dir(job.paths.images) as fresh:
+        if capture.video is not None:
+            records = save_frames(capture.video, fresh, params.frames, params.max_size)
+            origin = Origin(kind="video")
+        else:
+            records, origin = _from_photos(job, capture, fresh, params)
+        write_images_json(fresh, with_split(records, params.holdout), origin)
+    for sentence in origin.said:
+        log.warning("%s", sentence)
+    width, height = records[0].size
+    more = f", with poses from {origin.posed}" if origin.posed else ""
+    return f"{len(records)} images of {width}x{height} in {job.paths.images}{more}"
+
+
+def _from_photos(
+    job: Job, capture: Capture, folder: Path, params: Params
+) -> tuple[list[ImageRecord], Origin]:
     photos = map_named(
-        examine, {name: (path,) for name, path in sources.items()},
+        examine, {name: (path,) for name, path in capture.photos.items()},
         job_label="reading photos", scheduler=job.scheduler,
     )  # fmt: skip
-    turns = common_turns(photos)
-    with publish_dir(job.paths.images) as fresh:
-        sizes = map_named(
-            convert,
-            {name: (sources[name], fresh / name, turns[name], params.max_size) for name in sources},
-            job_label="writing images", scheduler=job.scheduler,
-        )  # fmt: skip
-        records = []
-        for index, name in enumerate(sorted(sources)):
-            held_out = params.holdout > 0 and index % params.holdout == 0
-            records.append(
-                _record(name, sources[name].name, photos[name], turns[name], sizes[name], held_out)
-            )
-        write_images_json(fresh, records)
-    turned = sum(record.turned != 0 for record in records)
-    if turned:
-        log.info(
-            "%d of %d photos stay turned, so that portrait and landscape have one size",
-            turned,
-            len(records),
+    turns = given_turns(photos, capture.views)
+    plan = plan_sizes(photos, mixed=params.mixed_sizes, fixed_turns=turns)
+    size = final_size(plan.size, params.max_size)
+    straighten = straighteners(capture.views)
+    map_named(
+        convert,
+        {
+            name: (capture.photos[name], folder / name, degrees, size, straighten.get(name))
+            for name, degrees in plan.turns.items()
+        },
+        job_label="writing images", scheduler=job.scheduler,
+    )  # fmt: skip
+    records = [
+        photos[name].record(
+            name,
+            capture.photos[name].relative_to(job.paths.data).as_posix(),
+            plan.turns[name],
+            size,
         )
-    width, height = records[0].size
-    return f"{len(records)} images of {width}x{height} in {job.paths.images}"
+        for name in sorted(plan.turns)
+    ]
+    if capture.views:
+        views = given_views(capture, plan, size, straighten)
+        write_transforms(folder / GIVEN_POSES, views)
+    share = write_given_masks(folder / GIVEN_MASKS, capture, photos, plan, size, straighten)
+    said = plan.said + (masks_said(capture.masked_by, share) if share is not None else [])
+    return records, Origin("photos", capture.posed_by, capture.masked_by, plan.left_out, said)
 
 
-def _record(
-    name: str, source: str, photo: Photo, degrees: int, size: tuple[int, int], held_out: bool
-) -> ImageRecord:
-    scale = max(size) / max(photo.width, photo.height)
-    return ImageRecord(
-        name=name,
-        source=source,
-        sha256=photo.sha256,
-        width=size[0],
-        height=size[1],
-        focal_px=round(photo.focal_px * scale, 3) if photo.focal_px else None,
-        split="test" if held_out else "train",
-        turned=(degrees - photo.upright_turn) % 360,
-    )
+def _flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="PATH",
+        help="a folder of photos, a capture with poses, or a video: copied to data/<scene>/, and the "
+        "scene is added to params.yaml",
+    )  # fmt: skip
+
+
+def _before(params_file: Path, flags: argparse.Namespace) -> None:
+    """With --from: puts the capture in place and the scene into params.yaml."""
+    if flags.source is None:
+        return
+    data = ScenePaths(params_file.parent, flags.scene).data
+    text = with_scene(params_file, flags.scene)
+    adopt(flags.source, data, FEWEST, read_colmap)
+    if text is not None:
+        write_text(params_file, text)
+        print(f"ingest: added the scene {flags.scene} to {params_file}")
 
 
 if __name__ == "__main__":
-    run("ingest", Params, main)
+    run("ingest", Params, main, add_flags=_flags, before=_before)

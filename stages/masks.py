@@ -11,9 +11,10 @@ from pydantic import Field
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir, write_json
+from pipeline.io.given_masks import pass_on_masks
 from pipeline.io.maps import read_map
 from pipeline.io.masks import write_keep_mask
-from pipeline.io.scene import ImageRecord, read_images_json
+from pipeline.io.scene import GIVEN_MASKS, ImageRecord, read_images_json
 from pipeline.masking import masks as masking
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
@@ -24,6 +25,7 @@ log = logging.getLogger(__name__)
 class Params(Section):
     """Section `masks`."""
 
+    use_given: bool
     threshold: Annotated[float, Field(ge=0, le=1)] | Literal["auto"]
     temporal_mean: Literal["auto", "on", "off"]
     mean_alone: bool
@@ -35,6 +37,9 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Makes `artifacts/<scene>/masks/` from the attention maps."""
     records = read_images_json(job.paths.images)
+    if params.use_given and (job.paths.images / GIVEN_MASKS).is_dir():
+        share = pass_on_masks(job.paths.images, records, job.paths.masks)
+        return f"{100 * share:.1f} % of the pixels masked, by the masks that came with the photos"
     maps = {record.name: _read_attention(job, record) for record in records}
     t, chosen = _threshold(list(maps.values()), params)
     mean = masking.temporal_mean(maps.values())

@@ -6,17 +6,26 @@ import logging
 from functools import partial
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field
 from tqdm import tqdm
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir, write_json
-from pipeline.io.scene import ImageRecord, read_images_json
-from pipeline.io.transforms import write_transforms
+from pipeline.io.scene import GIVEN_POSES, ImageRecord, read_images_json, read_origin
+from pipeline.io.transforms import read_transforms, write_transforms
 from pipeline.parallel import cores
-from pipeline.sfm import Reconstructed, Settings, reconstruct, write_sparse
+from pipeline.sfm import (
+    Progress,
+    Reconstructed,
+    Settings,
+    account,
+    reconstruct,
+    triangulate,
+    write_sparse,
+)  # fmt: skip
 from pipeline.stage import Job, Section, run
+
+LONG_VIDEO = 100  # frames
 
 log = logging.getLogger(__name__)
 
@@ -24,9 +33,10 @@ log = logging.getLogger(__name__)
 class Params(Section):
     """Section `poses`."""
 
+    use_given: bool
     use_masks: bool
     camera: Literal["single", "per_image"]
-    matcher: Literal["exhaustive", "sequential"]
+    matcher: Literal["auto", "exhaustive", "sequential"]
     mapper: Literal["incremental", "global"]
     max_features: Annotated[int, Field(ge=100, le=100_000)]
     max_image_size: Annotated[int, Field(ge=0)]
@@ -49,29 +59,45 @@ def main(job: Job, params: Params) -> str:
             "Run `python -m stages.masks` first, or set poses.use_masks: false.",
         )
     with tqdm(unit="photo", leave=False) as bar:
-        found = reconstruct(
-            paths.images,
-            paths.masks if params.use_masks else None,
-            [record.name for record in records],
-            work_dir=paths.work("poses"),
-            settings=_settings(params),
-            focal_px={record.name: record.focal_px for record in records if record.focal_px},
-            min_registered=params.min_registered,
-            depth_margin=params.depth_margin,
-            retry=params.retry,
-            seed=params.seed,
-            threads=cores(),
-            progress=partial(_show, bar),
-        )
+        found = _found(job, params, records, partial(_show, bar))
     with publish_dir(paths.poses) as fresh:
         write_sparse(found.model, fresh / "sparse")
         write_transforms(fresh / "transforms.json", found.views.values())
-        write_json(fresh / "poses.json", _summary(found, records))
+        write_json(fresh / "poses.json", account(found, len(records)))
     if found.lost and len(found.model_sizes) > 1:
         log.warning("models of %s photos were found; the largest is used", found.model_sizes)
     return (
         f"{len(found.views)} of {len(records)} photos placed, {len(found.points_xyz)} points, "
         f"{found.reprojection_px:.2f} px"
+    )
+
+
+def _found(
+    job: Job, params: Params, records: list[ImageRecord], progress: Progress
+) -> Reconstructed:
+    """Poses and points from the photos, or the poses that came with them and points for these."""
+    paths, names = job.paths, [record.name for record in records]
+    masks = paths.masks if params.use_masks else None
+    common: dict[str, Any] = {
+        "work_dir": paths.work("poses"),
+        "settings": _settings(params, read_origin(paths.images).kind, len(records)),
+        "depth_margin": params.depth_margin,
+        "seed": params.seed,
+        "threads": cores(),
+        "progress": progress,
+    }
+    given = paths.images / GIVEN_POSES
+    if params.use_given and given.is_file():
+        log.info("the poses that came with the photos are kept; points are found for them")
+        return triangulate(paths.images, masks, names, read_transforms(given), **common)
+    return reconstruct(
+        paths.images,
+        masks,
+        names,
+        focal_px={record.name: record.focal_px for record in records if record.focal_px},
+        min_registered=params.min_registered,
+        retry=params.retry,
+        **common,
     )
 
 
@@ -81,11 +107,12 @@ def _show(bar: tqdm, phase: str, done: int, total: int) -> None:
     bar.refresh()
 
 
-def _settings(params: Params) -> Settings:
-    same = ("camera", "matcher", "mapper", "max_features", "max_image_size")
+def _settings(params: Params, kind: str, count: int) -> Settings:
+    same = ("camera", "mapper", "max_features", "max_image_size")
     still = params.stationary == "drop" or (params.stationary == "auto" and not params.use_masks)
     return Settings(
         **{key: getattr(params, key) for key in same},
+        matcher=params.matcher if params.matcher != "auto" else _matcher(kind, count),
         masked=params.use_masks,
         still=still,
         refine_focal=params.refine_focal,
@@ -93,27 +120,9 @@ def _settings(params: Params) -> Settings:
     )
 
 
-def _summary(found: Reconstructed, records: list[ImageRecord]) -> dict[str, Any]:
-    """What poses.json holds: who was placed, who was not and why, and what was tried."""
-    return {
-        "total": len(records),
-        "registered": sorted(found.views),
-        "lost": [vars(image) for image in found.lost],
-        "images": {
-            name: {"keypoints": count, "best_match": found.matching.best_match[name]}
-            for name, count in found.matching.keypoints.items()
-        },
-        "reprojection_px": round(found.reprojection_px, 6),
-        "points": len(found.points_xyz),
-        "model_sizes": found.model_sizes,
-        "focal_px": round(float(np.median([view.fx for view in found.views.values()])), 4),
-        "masked": found.settings.masked,
-        "stationary_dropped": found.settings.still,
-        "tried": [
-            {**vars(one), "reprojection_px": one.reprojection_px and round(one.reprojection_px, 6)}
-            for one in found.attempts
-        ],
-    }
+def _matcher(kind: str, count: int) -> Literal["exhaustive", "sequential"]:
+    """Neighbours only for long videos: every pair costs the square of the count."""
+    return "sequential" if kind == "video" and count > LONG_VIDEO else "exhaustive"
 
 
 if __name__ == "__main__":

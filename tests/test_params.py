@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.params import Section, read_params, read_section, stage_names
+from pipeline.params import Section, read_params, read_section, stage_names, with_scene
 
 
 class Masks(Section):
@@ -95,3 +95,28 @@ def test_the_shipped_file_is_valid_and_complete() -> None:
         assert not optional, (
             f"{stage}: params.yaml must hold {optional}, so the model gives no defaults"
         )
+
+
+def test_a_scene_is_added_and_nothing_else_changes(tmp_path: Path) -> None:
+    text = (
+        "scene_defaults: &scene {masks: {}}  # all\nscenes:  # yours\n  demo: {<<: *scene}\n"
+        "  # a remark\nmasks: {threshold: 0.3}\n"
+    )
+    file = _file(tmp_path, text)
+    added = with_scene(file, "garden")
+    assert added == text.replace("  # a remark", "  garden: {<<: *scene}\n  # a remark")
+    assert with_scene(file, "demo") is None
+    file.write_text("scene_defaults: &scene {masks: {}}\nscenes:\n  demo: {}")
+    assert with_scene(file, "b") == file.read_text() + "\n  b: {<<: *scene}\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["scenes: {demo: {}}\nmasks: {}\n", "scenes:\n  demo: {}\nmasks: {}\n", "masks: {}\n"],
+)
+def test_a_scene_that_cannot_be_added_is_told_with_the_line_to_write(
+    tmp_path: Path, text: str
+) -> None:
+    """A flow mapping, no anchor, no scenes."""
+    with pytest.raises(UserError, match=r"garden: \{<<: \*scene\}"):
+        with_scene(_file(tmp_path, text), "garden")

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError, features
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import write_bytes
 
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+PHOTO_SUFFIXES = frozenset(
+    {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif"}
+)
 MAX_PIXELS = 200_000_000
 # EXIF orientation -> degrees counter-clockwise that make the stored pixels upright. The mirrored codes
 # (2, 4, 5, 7) come from editing programs, not cameras; they are undone before the turn.
@@ -59,12 +62,25 @@ def image_size(path: Path) -> tuple[int, int]:
         return photo.size
 
 
+@cache
+def can_read(suffix: str) -> bool:
+    """Whether photos with this lower-case suffix can be read here; HEIC needs an optional package."""
+    if suffix in (".heic", ".heif"):
+        try:
+            from pillow_heif import register_heif_opener
+        except ImportError:
+            return False
+        register_heif_opener()
+    return suffix != ".avif" or bool(features.check("avif"))
+
+
 def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
     """The stored pixels of a user's photo, (H, W, 3) uint8 RGB as the sensor saw them, and its metadata.
 
     Grey, palette, RGBA (over black), CMYK and 16-bit files are converted to 8-bit RGB. UserError for what
     is not an image, is cut short, or has more than MAX_PIXELS.
     """
+    can_read(path.suffix.lower())  # registers what reads HEIC, once in every process
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -94,6 +110,9 @@ def _sensor_pixels(photo: Image.Image) -> np.ndarray:
         scale = 255.0 / 65535.0 if values.max() > 255 else 1.0
         grey = np.rint(np.clip(values * scale, 0, 255)).astype(np.uint8)
         pixels = np.repeat(grey[..., None], 3, axis=2)
+    elif photo.has_transparency_data:
+        black = Image.new("RGBA", photo.size, (0, 0, 0, 255))
+        pixels = np.array(Image.alpha_composite(black, photo.convert("RGBA")).convert("RGB"))
     else:
         pixels = np.array(photo.convert("RGB"))
     flip = _MIRRORED.get(_orientation(photo))
@@ -127,11 +146,10 @@ def turn(pixels: np.ndarray, degrees: int) -> np.ndarray:
     return np.ascontiguousarray(np.rot90(pixels, (degrees // 90) % 4))
 
 
-def shrink(pixels: np.ndarray, longest_side: int) -> np.ndarray:
-    """`pixels` scaled down by area averaging until no side exceeds `longest_side`; never enlarged."""
+def resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """`pixels` scaled to `size` (width, height): by area averaging down, bicubically up."""
     height, width = pixels.shape[:2]
-    factor = longest_side / max(height, width)
-    if factor >= 1.0:
+    if (width, height) == size:
         return pixels
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    smaller = size[0] * size[1] < width * height
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)

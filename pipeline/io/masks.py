@@ -1,7 +1,12 @@
-"""Keep masks on disk: 8-bit PNG, 255 = keep, 0 = drop, as COLMAP and nerfstudio read them."""
+"""Keep masks on disk: 8-bit PNG, 255 = keep, 0 = drop, as COLMAP and nerfstudio read them.
+
+DerainNeRF's own rainMask.npy is the other way round, [H, W, N] with 1 = drop; it is read and written
+here and nowhere else.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -46,3 +51,53 @@ def read_keep_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarra
             f"{path} holds values other than 0 (drop) and 255 (keep).", "Threshold it first."
         )
     return values == 255
+
+
+def read_foreign_mask(path: Path) -> np.ndarray:
+    """An (H, W) boolean keep mask (True = use) from another program's mask picture.
+
+    Black is dropped: 8-bit values from 128 up are kept; in a file of 0 and 1, the ones. Colour and
+    alpha are ignored where all channels agree. UserError when unreadable or coloured.
+    """
+    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise UserError(f"{path} is not a readable image.", "Save the mask as 8-bit grey PNG.")
+    if values.ndim == 3:
+        colours = values[..., :3]
+        if (colours != colours[..., :1]).any():
+            raise UserError(f"{path} is coloured; a mask is black and white.", "Save it as grey.")
+        values = colours[..., 0]
+    top = int(values.max())
+    return values >= (1 if top <= 1 else 128 if values.dtype == np.uint8 else 32768)
+
+
+def rain_mask(keep_masks: Sequence[np.ndarray]) -> np.ndarray:
+    """DerainNeRF's array (H, W, N) uint8, 1 = drop, of N keep masks (H, W) in the images' name order."""
+    return np.stack([~keep_mask for keep_mask in keep_masks], axis=-1).astype(np.uint8)
+
+
+def read_rain_mask(path: Path, count: int) -> np.ndarray:
+    """Keep masks (N, H, W), True = use, from a rainMask.npy of `count` images: (H, W, N), 1 = drop.
+
+    Soft masks are cut at 0.5. UserError when damaged, of another shape, or not within [0, 1].
+    """
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path} is not a readable array ({error}).") from None
+    if values.ndim != 3 or values.shape[2] != count:
+        raise UserError(
+            f"{path} has shape {values.shape}; (height, width, {count}) is expected.",
+            "Its last axis counts the photos in name order, and every photo needs its mask.",
+        )
+    if values.dtype != np.bool_ and not ((values >= 0) & (values <= 1)).all():
+        raise UserError(f"{path} holds values outside 0 (keep) to 1 (drop).", "Divide it by 255.")
+    return np.moveaxis(values < 0.5 if values.dtype != np.bool_ else ~values, -1, 0)
+
+
+def fit_mask(keep_mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """`keep_mask` (H, W) scaled to `size` (w, h): kept where at least half of the area is."""
+    if keep_mask.shape == (size[1], size[0]):
+        return keep_mask
+    share = cv2.resize(keep_mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return share >= 0.5

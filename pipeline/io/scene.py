@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +11,9 @@ from pipeline.errors import UserError
 from pipeline.io.atomic import read_json, write_json
 
 FILE = "images.json"
+# Beside the images, where a capture brought its own: poses of the images as they lie here, keep masks.
+GIVEN_POSES = "transforms.json"
+GIVEN_MASKS = "masks"
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,36 @@ class ImageRecord:
         return self.width, self.height
 
 
-def write_images_json(folder: Path, records: Sequence[ImageRecord]) -> None:
+@dataclass(frozen=True)
+class Origin:
+    """Where the images came from: `kind` of capture, who `posed` and `masked` it ("" for nobody), the
+    photos that were `left_out`, and what the user should know, as sentences (`said`)."""
+
+    kind: Literal["photos", "video"] = "photos"
+    posed: str = ""
+    masked: str = ""
+    left_out: list[str] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)
+
+
+def write_images_json(
+    folder: Path, records: Sequence[ImageRecord], origin: Origin | None = None
+) -> None:
     """Writes `images.json` into `folder`."""
-    write_json(folder / FILE, {"images": [asdict(record) for record in records]})
+    images = [asdict(record) for record in records]
+    write_json(folder / FILE, {"images": images, "origin": asdict(origin or Origin())})
+
+
+def read_origin(folder: Path) -> Origin:
+    """Where a scene's images came from; UserError when `ingest` has not run or the list is damaged."""
+    content = read_json(folder / FILE, made_by="ingest")
+    try:
+        return Origin(**content.get("origin", {}))
+    except (AttributeError, TypeError) as error:
+        raise UserError(
+            f"{folder / FILE} is not a list of images ({error}).",
+            "Run `python -m stages.ingest` again.",
+        ) from None
 
 
 def read_images_json(folder: Path) -> list[ImageRecord]:
@@ -57,3 +87,12 @@ def read_images_json(folder: Path) -> list[ImageRecord]:
             "Run `python -m stages.ingest` again.",
         ) from None
     return sorted(records, key=lambda record: record.name)
+
+
+def with_split(records: Sequence[ImageRecord], every: int) -> list[ImageRecord]:
+    """The records with every n-th in name order held out of the fit ("test"), from the first; 0: none."""
+    ordered = sorted(records, key=lambda record: record.name)
+    return [
+        replace(record, split="test" if every > 0 and index % every == 0 else "train")
+        for index, record in enumerate(ordered)
+    ]

@@ -6,8 +6,21 @@ writes abort the process; hence the import below, which must stay first.
 
 import zlib  # noqa: F401
 
+from pipeline.sfm.database import Progress
+from pipeline.sfm.given import read_colmap, triangulate
 from pipeline.sfm.model import write_sparse
 from pipeline.sfm.reconstruct import reconstruct
-from pipeline.sfm.result import Attempt, LostImage, Reconstructed, Settings
+from pipeline.sfm.result import Attempt, LostImage, Reconstructed, Settings, account
 
-__all__ = ["Attempt", "LostImage", "Reconstructed", "Settings", "reconstruct", "write_sparse"]
+__all__ = [
+    "Attempt",
+    "LostImage",
+    "Progress",
+    "Reconstructed",
+    "Settings",
+    "account",
+    "read_colmap",
+    "reconstruct",
+    "triangulate",
+    "write_sparse",
+]

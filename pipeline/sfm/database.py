@@ -154,10 +154,13 @@ def read_matching(path: Path) -> Matching:
         pair_ids, geometries = database.read_two_view_geometries()
     best = dict.fromkeys(keypoints, 0)
     partner: dict[str, str | None] = dict.fromkeys(keypoints)
+    features: dict[str, set[int]] = {name: set() for name in keypoints}
     for pair_id, geometry in sorted(zip(pair_ids, geometries, strict=True), key=lambda p: p[0]):
         count = len(geometry.inlier_matches)
         first, second = (names[i] for i in pycolmap.pair_id_to_image_pair(pair_id))
-        for name, other in ((first, second), (second, first)):
+        for side, (name, other) in enumerate(((first, second), (second, first))):
+            features[name].update(geometry.inlier_matches[:, side].tolist())
             if count > best[name]:
                 best[name], partner[name] = count, other
-    return Matching(keypoints, best, partner)
+    matched = {name: len(found) for name, found in features.items()}
+    return Matching(keypoints, best, partner, matched)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib  # noqa: F401  before pycolmap, see the package
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ def views_of(model: pycolmap.Reconstruction, margin: float) -> dict[str, View]:
         if not image.has_pose:
             continue
         pose = as_4x4(image.cam_from_world().matrix())
-        near, far = _depth_range(model, image, pose, everything, margin)
+        near, far = _depth_range(model, image, pose, everything, margin) or (0.0, 0.0)
         camera = image.camera
         focal, cx, cy, k1 = (float(value) for value in camera.params)
         views[image.name] = View(
@@ -66,7 +67,7 @@ def _depth_range(
     pose: np.ndarray,
     everything: np.ndarray,
     margin: float,
-) -> tuple[float, float]:
+) -> tuple[float, float] | None:
     seen = [model.points3D[p.point3D_id] for p in image.get_observation_points2D()]
     sure = [point.xyz for point in seen if len(point.track.elements) >= SURE_VIEWS]
     for points in (np.array(sure).reshape(-1, 3), everything):
@@ -75,7 +76,17 @@ def _depth_range(
         if len(depth):
             low, high = np.percentile(depth, DEPTH_PERCENTILES)
             return float(low * (1.0 - margin)), float(high * (1.0 + margin))
-    return 0.0, 0.0
+    return None
+
+
+def with_depths(view: View, model: pycolmap.Reconstruction, margin: float) -> View:
+    """`view` with the depths of the points that its image sees, where it does not know them itself."""
+    if 0 < view.near < view.far:
+        return view
+    everything = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    image = model.find_image_with_name(view.name)
+    bounds = _depth_range(model, image, view.cam_from_world, everything, margin) if image else None
+    return view if bounds is None else replace(view, near=bounds[0], far=bounds[1])
 
 
 def implausible(views: dict[str, View]) -> str | None:

@@ -87,10 +87,10 @@ def reconstruct(
     names = sorted(names)
     if len(names) < 2:
         raise UserError(f"{len(names)} photo in {image_dir}: poses need two or more.")
-    sizes = _check_inputs(image_dir, mask_dir if settings.masked else None, names)
+    sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     work_dir.mkdir(parents=True, exist_ok=True)
-    report = progress if progress is not None else _silent
+    report = progress if progress is not None else silent
     tries: list[_Try] = []
     best: _Try | None = None
     database = work_dir / "database.db"
@@ -116,7 +116,7 @@ def reconstruct(
     return _result(best, tries, names, min_registered, depth_margin, image_dir)
 
 
-def _silent(phase: str, done: int, total: int) -> None:
+def silent(phase: str, done: int, total: int) -> None:
     pass
 
 
@@ -139,7 +139,7 @@ def ladder(settings: Settings, masks_exist: bool) -> Iterator[tuple[str, Setting
         yield "without masks", replace(more, masked=False, still=True)
 
 
-def _check_inputs(
+def check_inputs(
     image_dir: Path, mask_dir: Path | None, names: Sequence[str]
 ) -> dict[str, tuple[int, int]]:
     """Sizes by name. Everything pycolmap would pass over in silence is refused here."""

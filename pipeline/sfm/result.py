@@ -53,11 +53,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Matching:
-    """Per image: features outside the mask, and the most verified matches with one other image."""
+    """Per image: features outside the mask, the most verified matches with one other image, and the
+    features that match in any other (`matched`)."""
 
     keypoints: dict[str, int]
     best_match: dict[str, int]
     best_partner: dict[str, str | None]
+    matched: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -105,3 +107,26 @@ class Reconstructed:
     attempts: list[Attempt]
     settings: Settings
     model: Any = field(repr=False)  # the pycolmap.Reconstruction, for write_sparse only
+
+
+def account(found: Reconstructed, total: int) -> dict[str, Any]:
+    """What poses.json holds: who of `total` was placed, who was not and why, and what was tried."""
+    return {
+        "total": total,
+        "registered": sorted(found.views),
+        "lost": [vars(image) for image in found.lost],
+        "images": {
+            name: {"keypoints": count, "best_match": found.matching.best_match[name]}
+            for name, count in found.matching.keypoints.items()
+        },
+        "reprojection_px": round(found.reprojection_px, 6),
+        "points": len(found.points_xyz),
+        "model_sizes": found.model_sizes,
+        "focal_px": round(float(np.median([view.fx for view in found.views.values()])), 4),
+        "masked": found.settings.masked,
+        "stationary_dropped": found.settings.still,
+        "tried": [
+            {**vars(one), "reprojection_px": one.reprojection_px and round(one.reprojection_px, 6)}
+            for one in found.attempts
+        ],
+    }

@@ -7,8 +7,16 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import UserError
-from pipeline.io.images import read_photo, turn
-from pipeline.io.photos import common_turns, convert, examine, image_name, list_photos
+from pipeline.io.images import can_read, image_size, read_photo, turn
+from pipeline.io.photos import (
+    Photo,
+    convert,
+    examine,
+    final_size,
+    image_name,
+    list_photos,
+    plan_sizes,
+)
 
 ORIENTATION = 0x0112
 FOCAL_35MM = 0xA405
@@ -53,28 +61,74 @@ def test_portrait_and_landscape_of_one_camera_get_one_size(tmp_path: Path) -> No
         name: examine(_photo(tmp_path / name, orientation=orientation))
         for name, orientation in (("a.jpg", 1), ("b.jpg", 1), ("c.jpg", 6))
     }
-    turns = common_turns(photos)
-    assert turns == {"a.jpg": 0, "b.jpg": 0, "c.jpg": 0}, "all in the frame of the sensor"
+    plan = plan_sizes(photos)
+    assert plan.turns == {"a.jpg": 0, "b.jpg": 0, "c.jpg": 0}, "all in the frame of the sensor"
+    assert (plan.size, plan.left_out) == ((40, 30), [])
+    assert plan.said == ["1 of 3 photos stay turned, so that portrait and landscape have one size"]
     portraits = {
         name: examine(_photo(tmp_path / name, orientation=6)) for name in ("d.jpg", "e.jpg")
     }
-    assert set(common_turns(portraits).values()) == {270}, "all portrait: upright"
+    plan = plan_sizes(portraits)
+    assert set(plan.turns.values()) == {270}, "all portrait: upright"
+    assert (plan.size, plan.said) == ((30, 40), [])
 
 
-def test_mixed_sizes_are_refused_with_the_sizes(tmp_path: Path) -> None:
-    photos = {
-        "a.png": examine(_photo(tmp_path / "a.jpg", (40, 30))),
-        "b.png": examine(_photo(tmp_path / "b.jpg", (44, 30))),
+def _examined(folder: Path, *sizes: tuple[int, int]) -> dict[str, Photo]:
+    return {
+        f"{number}.png": examine(_photo(folder / f"{number}.jpg", size))
+        for number, size in enumerate(sizes)
     }
-    with pytest.raises(UserError, match=r"1 of 40x30, 1 of 44x30"):
-        common_turns(photos)
 
 
-def test_images_are_only_ever_scaled_down(tmp_path: Path) -> None:
+def test_photos_of_one_shape_are_scaled_to_the_smallest_and_it_is_said(tmp_path: Path) -> None:
+    photos = _examined(tmp_path, (80, 60), (40, 30), (80, 60), (57, 43))
+    plan = plan_sizes(photos)
+    assert (plan.size, plan.left_out) == ((40, 30), ["3.png"])
+    assert "2 of 80x60, 1 of 40x30" in plan.said[0]
+    assert "3.png" in plan.said[1], "57/43 = 1.326 is not 4/3"
+    with pytest.raises(UserError, match=r"mixed sizes: 2 of 80x60, 1 of 40x30, 1 of 57x43"):
+        plan_sizes(photos, mixed="refuse")
+
+
+def test_photos_that_fall_apart_into_many_shapes_are_refused(tmp_path: Path) -> None:
+    photos = _examined(tmp_path, (40, 30), (44, 30), (48, 30))
+    with pytest.raises(UserError, match=r"1 of 40x30, 1 of 44x30, 1 of 48x30"):
+        plan_sizes(photos)
+
+
+def test_images_have_the_size_that_was_planned(tmp_path: Path) -> None:
+    assert final_size((400, 300), 200) == (200, 150)
+    assert final_size((400, 300), 0) == final_size((400, 300), 4000) == (400, 300)
     path = _photo(tmp_path / "a.jpg", (400, 300))
-    assert convert(path, tmp_path / "a.png", 0, 200) == (200, 150)
-    assert convert(path, tmp_path / "b.png", 90, 0) == (300, 400)
-    assert convert(path, tmp_path / "c.png", 0, 4000) == (400, 300)
+    convert(path, tmp_path / "a.png", 0, (200, 150))
+    convert(path, tmp_path / "b.png", 90, (300, 400))
+    assert image_size(tmp_path / "a.png") == (200, 150)
+    assert image_size(tmp_path / "b.png") == (300, 400)
+
+
+def test_what_is_transparent_is_black(tmp_path: Path) -> None:
+    pixels = np.full((6, 8, 4), 255, np.uint8)
+    pixels[:, :4, 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    read, _ = read_photo(tmp_path / "a.png")
+    assert read[:, :4].max() == 0 and read[:, 4:].min() == 255
+
+
+def test_heic_and_avif_are_read_where_the_packages_are(tmp_path: Path) -> None:
+    for name in ("a.heic", "b.avif"):
+        if not can_read(Path(name).suffix):
+            continue
+        Image.new("RGB", (64, 48), "white").save(tmp_path / name)
+        assert examine(tmp_path / name).size_after(0) == (64, 48)
+
+
+def test_heic_without_its_package_names_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.io.photos.can_read", lambda suffix: suffix != ".heic")
+    (tmp_path / "a.heic").touch()
+    with pytest.raises(UserError, match=r"HEIC files need another package.*\[heic\]"):
+        list_photos(tmp_path, 1)
 
 
 @pytest.mark.parametrize("mode", ["L", "RGBA", "P", "CMYK", "I;16", "LA"])
@@ -119,7 +173,7 @@ def test_the_folder_is_listed_by_the_names_images_will_have(tmp_path: Path) -> N
         list_photos(tmp_path, 1)
 
 
-def test_kinds_that_cannot_be_read_name_the_remedy(tmp_path: Path) -> None:
-    (tmp_path / "a.heic").touch()
+def test_raw_files_name_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "a.dng").touch()
     with pytest.raises(UserError, match="Convert them to JPEG"):
         list_photos(tmp_path, 1)

@@ -1,0 +1,204 @@
+"""What a user's folder holds: photos or a video, with or without poses and masks of their own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import publish_dir
+from pipeline.io.given import GivenView, read_nerfstudio, read_poses_bounds
+from pipeline.io.images import PHOTO_SUFFIXES
+from pipeline.io.photos import VIDEO_SUFFIXES, by_image_name, image_name, list_photos
+
+TRANSFORMS = "transforms.json"
+POSES_BOUNDS = "poses_bounds.npy"
+RAIN_MASK = "rainMask.npy"
+MASKS = "masks"
+TRUTH = "truth"
+COLMAP_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+ColmapReader = Callable[[Path, Sequence[Path]], list[GivenView]]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A folder understood.
+
+    `photos` by image name, in name order; empty for a `video`. `posed_by` names the format of the poses
+    that came along, `views` holds them by image name. `masks` are keep-mask pictures by image name,
+    `rain_mask` is DerainNeRF's array of all masks. `model` is the folder of a COLMAP model.
+    """
+
+    photos: dict[str, Path] = field(default_factory=dict)
+    video: Path | None = None
+    posed_by: str = ""
+    views: dict[str, GivenView] = field(default_factory=dict)
+    masks: dict[str, Path] = field(default_factory=dict)
+    rain_mask: Path | None = None
+    model: Path | None = None
+
+    @property
+    def masked_by(self) -> str:
+        """Which masks came along, "" for none."""
+        if self.rain_mask is not None:
+            return self.rain_mask.name
+        return "mask pictures" if self.masks else ""
+
+
+def find_capture(folder: Path, at_least: int, read_colmap: ColmapReader) -> Capture:
+    """What `folder` holds. A video alone; else photos with what lies beside them.
+
+    Poses are taken from transforms.json, poses_bounds.npy or a COLMAP model, in this order; photos then
+    may lie in `images/`. Masks are those that transforms.json names, rainMask.npy, or `masks/` with a
+    picture for every photo. UserError for folders that cannot be used, saying why.
+    """
+    videos = _videos(folder)
+    if videos:
+        return Capture(video=_only_video(folder, videos))
+    if (folder / TRANSFORMS).is_file():
+        views = read_nerfstudio(folder / TRANSFORMS)
+        photos, posed_by, model = by_image_name(view.photo for view in views), "nerfstudio", None
+        _enough(folder, photos, at_least)
+    else:
+        model = find_model(folder)
+        posed = model is not None or (folder / POSES_BOUNDS).is_file()
+        photos = list_photos(_photo_folder(folder) if posed else folder, at_least)
+        views, posed_by = [], ""
+        if (folder / POSES_BOUNDS).is_file():
+            views, posed_by = read_poses_bounds(folder / POSES_BOUNDS, _files(photos)), "LLFF"
+        elif model is not None:
+            views, posed_by = read_colmap(model, _files(photos)), "COLMAP"
+    return Capture(
+        photos=dict(sorted(photos.items())),
+        posed_by=posed_by,
+        views={image_name(view.photo): view for view in views},
+        masks=_masks(folder, photos, views),
+        rain_mask=folder / RAIN_MASK if (folder / RAIN_MASK).is_file() else None,
+        model=model,
+    )
+
+
+def _videos(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
+    ]
+
+
+def _only_video(folder: Path, videos: list[Path]) -> Path:
+    photos = [path for path in folder.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES]
+    if len(videos) > 1 or photos:
+        more = videos[1] if len(videos) > 1 else min(photos)
+        raise UserError(
+            f"{folder} holds {videos[0].name} and {more.name}.",
+            "A scene is one video, or photos; move the others away.",
+        )
+    return videos[0]
+
+
+def _enough(folder: Path, photos: dict[str, Path], at_least: int) -> None:
+    if len(photos) < at_least:
+        raise UserError(
+            f"{folder / TRANSFORMS} names {len(photos)} photos; a scene needs at least {at_least}."
+        )
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of a COLMAP model (text or binary) at one of its usual places under `folder`."""
+    for place in COLMAP_PLACES:
+        for suffix in (".bin", ".txt"):
+            parts = [folder / place / (part + suffix) for part in ("cameras", "images", "points3D")]
+            if all(part.is_file() for part in parts):
+                return folder / place
+    return None
+
+
+def _photo_folder(folder: Path) -> Path:
+    """Where the photos of a posed capture lie: here, in images/, or in the largest images_<factor>/."""
+    if any(path.suffix.lower() in PHOTO_SUFFIXES for path in folder.iterdir()):
+        return folder
+    smaller = sorted(
+        (path for path in folder.glob("images_*") if path.name[7:].isdigit()),
+        key=lambda path: int(path.name[7:]),
+    )
+    for candidate in (folder / "images", *smaller):
+        if candidate.is_dir():
+            return candidate
+    raise UserError(f"{folder} has poses, but no photos.", f"Put them into {folder / 'images'}.")
+
+
+def _files(photos: dict[str, Path]) -> list[Path]:
+    """The photos in the order of their own file names, which is how other programs pair them."""
+    return sorted(photos.values(), key=lambda path: path.name)
+
+
+def _masks(folder: Path, photos: dict[str, Path], views: Iterable[GivenView]) -> dict[str, Path]:
+    named = {image_name(view.photo): view.mask_path for view in views}
+    if any(named.values()):
+        return {name: path for name, path in named.items() if path is not None}
+    if not (folder / MASKS).is_dir() or (folder / RAIN_MASK).is_file():
+        return {}
+    found: dict[str, Path] = {}
+    for name, photo in photos.items():
+        # COLMAP's way first (IMG_1.jpg.png), then the photo's name, then its stem.
+        for candidate in (f"{photo.name}.png", photo.name, f"{photo.stem}.png"):
+            if (folder / MASKS / candidate).is_file():
+                found[name] = folder / MASKS / candidate
+                break
+    missing = sorted(photos.keys() - found.keys())
+    if found and missing:
+        shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if missing[3:] else "")
+        raise UserError(
+            f"{folder / MASKS} has no mask for {shown}.", "Give every photo a mask, or none."
+        )
+    return found
+
+
+def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) -> None:
+    """Copies a capture, a folder or a video file, to `data`, which appears whole or not at all.
+
+    What belongs to the capture is copied and nothing else, with its place in the folder kept; `truth/`
+    goes along. UserError when `data` exists, or when the capture cannot be used.
+    """
+    source = Path(os.path.normpath(source))
+    if data.exists():
+        raise UserError(
+            f"{data} exists already.", "Choose another --scene, or leave --from away to use it."
+        )
+    if source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
+        with publish_dir(data) as fresh:
+            shutil.copyfile(source, fresh / source.name)
+        return
+    if not source.is_dir():
+        raise UserError(f"{source} is no folder and no video.", "Name the folder of your photos.")
+    capture = find_capture(source, at_least, read_colmap)
+    files = _belonging(source, capture)
+    outside = [path for path in files if not Path(os.path.normpath(path)).is_relative_to(source)]
+    if outside:
+        raise UserError(
+            f"{source / TRANSFORMS} names {outside[0]}, which lies outside of {source}.",
+            "Copy the capture into one folder first.",
+        )
+    with publish_dir(data) as fresh:
+        for path in files:
+            target = fresh / path.relative_to(source)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+        if (source / TRUTH).is_dir():
+            shutil.copytree(source / TRUTH, fresh / TRUTH)
+
+
+def _belonging(source: Path, capture: Capture) -> list[Path]:
+    files = {*capture.photos.values(), *capture.masks.values()}
+    if capture.video:
+        files.add(capture.video)
+    files |= {source / name for name in (TRANSFORMS, POSES_BOUNDS, RAIN_MASK)}
+    if capture.model:
+        files |= {path for path in capture.model.iterdir() if path.suffix in (".bin", ".txt")}
+    return sorted(path for path in files if path.is_file())

@@ -1,0 +1,130 @@
+"""Frames of a video that serve as photos: sharp ones, evenly spread over the camera's way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+
+from pipeline.errors import UserError
+from pipeline.io.images import resized, turn, write_image
+from pipeline.io.photos import file_sha256, final_size
+from pipeline.io.scene import ImageRecord
+
+GLANCE_PX = 160  # longest side of the small picture in which motion is measured
+LOOK_PX = 480  # longest side of the picture in which sharpness is measured
+STILL_PX = 0.05  # less motion than this between two small pictures is noise
+MIDDLE = 0.6  # share of its stretch of the way in which a frame is looked for
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A chosen frame: its number in the stream, its time in seconds, its turn to be upright (ccw)."""
+
+    index: int
+    seconds: float
+    upright_turn: int
+
+
+def pick_frames(path: Path, count: int) -> list[Frame]:
+    """At most `count` frames of the video at `path`, in order: the sharpest of each stretch of motion.
+
+    The way of the camera is the sum of the median optical flow between neighbouring frames; it is cut
+    into `count` stretches of equal length, so that a camera at rest gives no frames twice. Sharpness is
+    the variance of the Laplacian. One frame is held at a time. UserError when the file is no video or
+    the camera never moves.
+    """
+    frames, motion, sharpness = [], [], []
+    last: np.ndarray | None = None
+    for index, frame in enumerate(_decoded(path)):
+        glance = _grey(frame, GLANCE_PX)
+        motion.append(0.0 if last is None else _median_flow(last, glance))
+        sharpness.append(float(cv2.Laplacian(_grey(frame, LOOK_PX), cv2.CV_32F).var()))
+        frames.append(Frame(index, round(float(frame.time or 0.0), 3), frame.rotation % 360))
+        last = glance
+    if not frames:
+        raise UserError(
+            f"{path} holds no frames.", "Copy it again, or save frames of it as photos."
+        )
+    way = np.cumsum(motion)
+    if way[-1] < GLANCE_PX / 100:
+        raise UserError(
+            f"{path}: the camera hardly moves.", "A scene needs a video from different places."
+        )
+    return [frames[index] for index in choose(way, np.array(sharpness), count)]
+
+
+def choose(way: np.ndarray, sharpness: np.ndarray, count: int) -> list[int]:
+    """Indices, ascending and distinct: the sharpest frame in the middle of each of `count` stretches.
+
+    way (N,) is the distance covered at each frame, never falling; sharpness (N,). A stretch that no
+    frame lies in gives none.
+    """
+    place = way / way[-1] * count
+    chosen = []
+    for stretch in range(count):
+        off = np.abs(place - (stretch + 0.5))
+        inside = np.flatnonzero(off <= MIDDLE / 2)
+        if not len(inside):
+            inside = np.flatnonzero(off <= 0.5)
+        if len(inside):
+            chosen.append(int(inside[np.argmax(sharpness[inside])]))
+    return sorted(set(chosen))
+
+
+def read_frames(path: Path, chosen: list[Frame]) -> Iterator[tuple[Frame, np.ndarray]]:
+    """The chosen frames, one at a time, upright: (H, W, 3) uint8 RGB."""
+    wanted = {frame.index: frame for frame in chosen}
+    for index, frame in enumerate(_decoded(path)):
+        if index in wanted:
+            pixels = frame.to_ndarray(format="rgb24")
+            yield wanted[index], turn(pixels, wanted[index].upright_turn)
+        if index >= max(wanted):
+            return
+
+
+def save_frames(path: Path, folder: Path, count: int, longest_side: int) -> list[ImageRecord]:
+    """Writes at most `count` frames of the video into `folder`, no side above `longest_side` (0: any).
+
+    Returns their records: `source` tells the video and the time, the checksum is the video's.
+    """
+    chosen, digest = pick_frames(path, count), file_sha256(path)
+    records: list[ImageRecord] = []
+    for frame, pixels in read_frames(path, chosen):
+        size = final_size((pixels.shape[1], pixels.shape[0]), longest_side)
+        name = f"frame_{len(records):04d}.png"
+        write_image(folder / name, resized(pixels, size))
+        source = f"{path.name} at {frame.seconds:.3f} s"
+        records.append(ImageRecord(name, source, digest, *size, None, "train", 0))
+    return records
+
+
+def _decoded(path: Path) -> Iterator[av.VideoFrame]:
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise UserError(f"{path} has no pictures, only sound.")
+            container.streams.video[0].thread_type = "AUTO"
+            yield from container.decode(container.streams.video[0])
+    except av.FFmpegError as error:
+        raise UserError(
+            f"{path} is not a video that can be read ({error.strerror}).",
+            "Copy it again, or convert it to MP4.",
+        ) from None
+
+
+def _grey(frame: av.VideoFrame, longest: int) -> np.ndarray:
+    factor = min(1.0, longest / max(frame.width, frame.height))
+    width, height = (max(2, round(side * factor)) for side in (frame.width, frame.height))
+    return frame.reformat(width=width, height=height, format="gray").to_ndarray()
+
+
+def _median_flow(last: np.ndarray, now: np.ndarray) -> float:
+    """The median length of the flow: drops that stay on the lens are a minority, it ignores them."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(last, now, None)
+    length = float(np.median(np.linalg.norm(flow, axis=2)))
+    return length if length >= STILL_PX else 0.0

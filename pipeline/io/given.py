@@ -1,0 +1,255 @@
+"""Poses and masks that come with photos: nerfstudio's transforms.json, LLFF's poses_bounds.npy.
+
+COLMAP models are read where pycolmap is (`pipeline.sfm`); what they say ends up here as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import read_json
+from pipeline.io.transforms import GL_FROM_CV, View
+
+SAME_SHAPE = 0.01  # how far the ratios of width to height of a photo and its camera may differ
+RIGID = 1e-4  # how far R R^T may be from the identity
+MOST_BENT = 0.25  # |k1| r^2 in the corner up to which rays through one radial term are exact
+_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+
+
+@dataclass(frozen=True)
+class GivenView:
+    """A photo's camera as its capture tells it.
+
+    `cam_from_world` (4, 4), OpenCV axes. `fx, fy, cx, cy` belong to an image of `width` x `height`
+    pixels, pixel (0, 0)'s centre at (0.5, 0.5). `distortion` holds OpenCV's coefficients in OpenCV's
+    order, of the fisheye model where `fisheye`. `near` and `far` bound the depths; 0 where unknown.
+    `mask_path` is the photo's keep mask, if the capture has one.
+    """
+
+    photo: Path
+    cam_from_world: np.ndarray
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    fisheye: bool = False
+    near: float = 0.0
+    far: float = 0.0
+    mask_path: Path | None = None
+
+    @property
+    def carried(self) -> bool:
+        """Whether the project's own camera, one radial term, says the same without resampling."""
+        if self.fisheye or any(self.distortion[1:]):
+            return False
+        corner = (0.5 * self.width / self.fx) ** 2 + (0.5 * self.height / self.fy) ** 2
+        return not self.distortion or abs(self.distortion[0]) * corner <= MOST_BENT
+
+    def turn_for(self, stored: tuple[int, int], upright_turn: int) -> int | None:
+        """Degrees ccw by which the stored pixels (w, h) become those of this camera; None: neither way."""
+        for degrees in (0, upright_turn):
+            width, height = stored if degrees % 180 == 0 else stored[::-1]
+            if abs(width * self.height / (height * self.width) - 1) < SAME_SHAPE:
+                return degrees
+        return None
+
+    def view(self, name: str, size: tuple[int, int]) -> View:
+        """The project's view of the same camera for an image of `size` (w, h) without bent lines."""
+        across, down = size[0] / self.width, size[1] / self.height
+        return View(
+            name=name,
+            cam_from_world=self.cam_from_world,
+            fx=self.fx * across,
+            fy=self.fy * down,
+            cx=self.cx * across,
+            cy=self.cy * down,
+            k1=self.distortion[0] if self.distortion else 0.0,
+            width=size[0],
+            height=size[1],
+            near=self.near,
+            far=self.far,
+        )
+
+
+@dataclass(frozen=True)
+class Straightener:
+    """Takes pixels of `bent` to those of the pinhole `straight`; both see (H, W) arrays of one shape."""
+
+    bent: GivenView
+    straight: GivenView
+
+    def __call__(self, pixels: np.ndarray) -> np.ndarray:
+        """The straightened picture (H, W, 3) or mask (H, W, nearest pixel)."""
+        size = (pixels.shape[1], pixels.shape[0])
+        source, target = _matrix(self.bent, size), _matrix(self.straight, size)
+        make: Any = cv2.fisheye if self.bent.fisheye else cv2
+        coefficients = np.array(self.bent.distortion, np.float64)
+        across, down = make.initUndistortRectifyMap(
+            source, coefficients, np.eye(3), target, size, cv2.CV_32FC1
+        )
+        how = cv2.INTER_NEAREST if pixels.ndim == 2 else cv2.INTER_CUBIC
+        return cv2.remap(pixels, across, down, how, borderMode=cv2.BORDER_CONSTANT)
+
+
+def straightened(view: GivenView) -> GivenView:
+    """The pinhole without distortion whose picture of the same size is covered by `view`'s wholly."""
+    size = (view.width, view.height)
+    matrix, coefficients = _matrix(view, size), np.array(view.distortion, np.float64)
+    if view.fisheye:
+        new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+            matrix, coefficients, size, np.eye(3), balance=0.0
+        )
+    else:
+        new = cv2.getOptimalNewCameraMatrix(matrix, coefficients, size, alpha=0.0)[0]
+    # OpenCV puts the centre of pixel (0, 0) at (0, 0).
+    return replace(
+        view,
+        fx=float(new[0, 0]),
+        fy=float(new[1, 1]),
+        cx=float(new[0, 2]) + 0.5,
+        cy=float(new[1, 2]) + 0.5,
+        distortion=(),
+        fisheye=False,
+    )
+
+
+def _matrix(view: GivenView, size: tuple[int, int]) -> np.ndarray:
+    """K (3, 3) for an image of `size` in OpenCV's pixel frame."""
+    across, down = size[0] / view.width, size[1] / view.height
+    return np.array(
+        [[view.fx * across, 0, view.cx * across - 0.5], [0, view.fy * down, view.cy * down - 0.5], [0, 0, 1]]
+    )  # fmt: skip
+
+
+def checked_rigid(pose: np.ndarray, whose: str) -> np.ndarray:
+    """`pose` (4, 4) itself; UserError naming `whose` it is when it is no rotation and translation."""
+    rotation = pose[:3, :3]
+    rigid = np.isfinite(pose).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID)
+    if not rigid or np.linalg.det(rotation) < 0:
+        raise UserError(f"{whose} is not a rotation and a translation.", "Export the poses again.")
+    return pose
+
+
+def read_nerfstudio(path: Path) -> list[GivenView]:
+    """The cameras of a nerfstudio (or instant-ngp) transforms.json, in the file's order.
+
+    Intrinsics stand at the top or in each frame. A mask is read per frame, all or none. UserError for a
+    damaged file, an unknown camera model, photos or masks that do not exist.
+    """
+    content = read_json(path)
+    try:
+        views = [_nerfstudio_view(path, content, frame) for frame in content["frames"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a list of posed photos ({error!r}).",
+            "nerfstudio's format is expected: frames with file_path and transform_matrix.",
+        ) from None
+    bare = [view.photo.name for view in views if view.mask_path is None]
+    if bare and len(bare) < len(views):
+        raise UserError(
+            f"{path} names no mask for {', '.join(bare)}.", "Give every frame a mask_path, or none."
+        )
+    return views
+
+
+def _nerfstudio_view(path: Path, content: dict[str, Any], frame: dict[str, Any]) -> GivenView:
+    both = {**content, **frame}
+    model = both.get("camera_model", "OPENCV")
+    if model not in _MODELS:
+        raise UserError(f"{path}: the camera model {model} is not known.", f"Known: {_MODELS}.")
+    photo = _existing(path, str(frame["file_path"]))
+    width, height = int(both.get("w", 0)), int(both.get("h", 0))
+    if not (width and height):
+        raise UserError(f"{path} does not tell the photos' size.", 'Add "w" and "h" in pixels.')
+    focal = float(both["fl_x"]) if "fl_x" in both else _focal(width, float(both["camera_angle_x"]))
+    fisheye = model == "OPENCV_FISHEYE"
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    world_from_gl = np.asarray(frame["transform_matrix"], np.float64).reshape(4, 4)
+    checked_rigid(world_from_gl, f"{path}: the pose of {photo.name}")
+    return GivenView(
+        photo=photo,
+        cam_from_world=np.linalg.inv(world_from_gl @ GL_FROM_CV),
+        width=width,
+        height=height,
+        fx=focal,
+        fy=float(both.get("fl_y", focal)),
+        cx=float(both.get("cx", width / 2)),
+        cy=float(both.get("cy", height / 2)),
+        distortion=tuple(float(both.get(key, 0.0)) for key in keys),
+        fisheye=fisheye,
+        near=float(frame.get("near", 0.0)),
+        far=float(frame.get("far", 0.0)),
+        mask_path=_existing(path, str(frame["mask_path"])) if "mask_path" in frame else None,
+    )
+
+
+def _focal(width: int, angle: float) -> float:
+    return 0.5 * width / math.tan(0.5 * angle)
+
+
+def _existing(path: Path, relative: str) -> Path:
+    """A file named by transforms.json; Blender's exports leave the suffix away."""
+    for candidate in (path.parent / relative, path.parent / f"{relative}.png"):
+        if candidate.is_file():
+            return candidate
+    raise UserError(
+        f"{path} names {relative}, which does not exist.", "Keep the file beside its photos."
+    )
+
+
+def read_poses_bounds(path: Path, photos: Sequence[Path]) -> list[GivenView]:
+    """The cameras of LLFF's poses_bounds.npy for `photos`, which are its rows in name order.
+
+    Each row is a (3, 5) matrix, world-from-camera with the axes down, right, back, then (H, W, f),
+    and the near and far depth. The principal point is the centre. UserError for a damaged file or
+    another number of photos.
+    """
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
+        raise UserError(f"{path} has shape {rows.shape}; N rows of 17 numbers are expected.")
+    if len(rows) != len(photos):
+        raise UserError(
+            f"{path} holds {len(rows)} poses, but there are {len(photos)} photos.",
+            "LLFF pairs them by name order; every photo needs its row.",
+        )
+    views = []
+    for photo, row in zip(sorted(photos), rows.astype(np.float64), strict=True):
+        matrix = row[:15].reshape(3, 5)
+        down, right, back, place, (height, width, focal) = matrix.T
+        world_from_cam = np.eye(4)
+        world_from_cam[:3] = np.stack([right, down, -back, place], axis=1)
+        checked_rigid(world_from_cam, f"{path}: the pose of {photo.name}")
+        views.append(
+            GivenView(
+                photo=photo,
+                cam_from_world=np.linalg.inv(world_from_cam),
+                width=round(width),
+                height=round(height),
+                fx=focal,
+                fy=focal,
+                cx=width / 2,
+                cy=height / 2,
+                near=float(row[15]),
+                far=float(row[16]),
+            )
+        )
+    return views
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array in a .npy file; UserError when it is damaged or holds Python objects."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path} is not a readable array ({error}).") from None

@@ -1,0 +1,124 @@
+"""What a capture brought along, poses and masks, made to fit the images that its photos become."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import UserError
+from pipeline.io.capture import Capture
+from pipeline.io.given import SAME_SHAPE, GivenView, Straightener, straightened
+from pipeline.io.images import turn
+from pipeline.io.masks import fit_mask, read_foreign_mask, read_rain_mask, write_keep_mask
+from pipeline.io.photos import Photo, Plan
+from pipeline.io.transforms import View
+
+SUSPECT = 0.6  # a set of masks that drops more than this is likely upside down
+
+
+def given_turns(
+    photos: Mapping[str, Photo], views: Mapping[str, GivenView]
+) -> dict[str, int] | None:
+    """Degrees ccw by which each photo's stored pixels become those of its camera; None without views.
+
+    Programs disagree on whether a photo's metadata turns it; the cameras' sizes tell. A photo without a
+    pose is turned as its neighbours are. UserError when a camera has the size of neither.
+    """
+    if not views:
+        return None
+    turns = {}
+    some = next(iter(views.values()))
+    for name, photo in photos.items():
+        view = views.get(name, some)
+        degrees = view.turn_for((photo.width, photo.height), photo.upright_turn)
+        if degrees is None:
+            raise UserError(
+                f"{view.photo} has {photo.width}x{photo.height} pixels, its camera "
+                f"{view.width}x{view.height}: the shapes differ.",
+                "Poses and photos do not belong together, or the photos were cropped.",
+            )
+        turns[name] = degrees
+    return turns
+
+
+def straighteners(views: Mapping[str, GivenView]) -> dict[str, Straightener]:
+    """By name, what takes away the distortion of the views that the project's camera cannot carry."""
+    return {
+        name: Straightener(view, straightened(view))
+        for name, view in views.items()
+        if not view.carried
+    }
+
+
+def given_views(
+    capture: Capture, plan: Plan, size: tuple[int, int], straighten: Mapping[str, Straightener]
+) -> list[View]:
+    """The capture's views for the images (of `size`) that its photos become, in name order."""
+    return [
+        (straighten[name].straight if name in straighten else view).view(name, size)
+        for name, view in sorted(capture.views.items())
+        if name in plan.turns
+    ]
+
+
+def given_masks(capture: Capture) -> Iterator[tuple[str, np.ndarray]]:
+    """The capture's keep masks (H, W), True = use, by image name, at the size they have there."""
+    if capture.rain_mask is not None:
+        order = sorted(capture.photos, key=lambda name: capture.photos[name].name)
+        masks = read_rain_mask(capture.rain_mask, len(order))
+        yield from zip(order, masks, strict=True)
+        return
+    for name, path in sorted(capture.masks.items()):
+        yield name, read_foreign_mask(path)
+
+
+def write_given_masks(
+    folder: Path,
+    capture: Capture,
+    photos: Mapping[str, Photo],
+    plan: Plan,
+    size: tuple[int, int],
+    straighten: Mapping[str, Straightener],
+) -> float | None:
+    """Writes the capture's keep masks as the images' into `folder`; their dropped share, None without.
+
+    UserError when a mask has another shape than its photo.
+    """
+    shares = []
+    for name, keep_mask in given_masks(capture):
+        if name not in plan.turns:
+            continue
+        turned = _turned_as_its_photo(name, keep_mask, photos[name], plan.turns[name])
+        if name in straighten:
+            turned = straighten[name](turned.astype(np.uint8)) > 0
+        fitted = fit_mask(turned, size)
+        write_keep_mask(folder / name, fitted)
+        shares.append(1.0 - float(fitted.mean()))
+    return float(np.mean(shares)) if shares else None
+
+
+def _turned_as_its_photo(
+    name: str, keep_mask: np.ndarray, photo: Photo, degrees: int
+) -> np.ndarray:
+    """A mask drawn over the stored pixels, or over the upright ones, turned as the image is."""
+    ratio = keep_mask.shape[1] / keep_mask.shape[0]
+    for already in (0, photo.upright_turn):
+        if abs(ratio / photo.ratio_after(already) - 1) < SAME_SHAPE:
+            return turn(keep_mask, degrees - already)
+    raise UserError(
+        f"the mask of {Path(name).stem} has {keep_mask.shape[1]}x{keep_mask.shape[0]} pixels, its "
+        f"photo {photo.width}x{photo.height}: the shapes differ.",
+        "A mask covers its whole photo.",
+    )
+
+
+def masks_said(masked: str, share: float) -> list[str]:
+    """What the user should hear of masks that came along, which drop `share` of the pixels."""
+    said = [f"masks came along ({masked}): {100 * share:.1f} % of the pixels are dropped"]
+    if share > SUSPECT:
+        said.append(
+            "the masks drop most of the photos: are they upside down? black is dropped here"
+        )
+    return said

@@ -1,0 +1,272 @@
+"""What lies in a user's folder, and how it comes in: poses and masks of other programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import UserError
+from pipeline.io.capture import Capture, adopt, find_capture
+from pipeline.io.given import (
+    GivenView,
+    Straightener,
+    read_nerfstudio,
+    read_poses_bounds,
+    straightened,
+)
+from pipeline.io.masks import fit_mask, rain_mask, read_foreign_mask, read_rain_mask
+
+NAMES = ("a.jpg", "b.jpg", "c.jpg")
+
+
+def _no_colmap(folder: Path, photos: Any) -> list[GivenView]:
+    raise AssertionError("there is no COLMAP model here")
+
+
+def _photos(folder: Path, size: tuple[int, int] = (40, 30)) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in NAMES:
+        Image.new("RGB", size, "grey").save(folder / name)
+
+
+def _find(folder: Path) -> Capture:
+    return find_capture(folder, 3, _no_colmap)
+
+
+def _llff_row(x: float, height: int, width: int, focal: float) -> np.ndarray:
+    """A camera at (x, 0, 0) that looks along +z with x right and y down: LLFF's axes by hand.
+
+    Columns: down (0, 1, 0), right (1, 0, 0), back (0, 0, -1), the place, (H, W, f).
+    """
+    matrix = np.array([[0, 1, 0, x, height], [1, 0, 0, 0, width], [0, 0, -1, 0, focal]], np.float64)
+    return np.concatenate([matrix.ravel(), [2.0, 9.0]])
+
+
+def test_llff_axes_size_and_depths_are_read(tmp_path: Path) -> None:
+    _photos(tmp_path / "images")
+    rows = np.stack([_llff_row(x, 300, 400, 350.0) for x in (0.0, 1.0, 2.0)])
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    capture = _find(tmp_path)
+    assert capture.posed_by == "LLFF"
+    view = capture.views["b.png"].view("b.png", (40, 30))
+    expected = np.eye(4)
+    expected[0, 3] = -1.0
+    assert np.allclose(view.cam_from_world, expected)
+    # f = 350 at 400 x 300 is 35 at 40 x 30.
+    assert (view.fx, view.fy, view.cx, view.cy, view.k1) == (35.0, 35.0, 20.0, 15.0, 0.0)
+    assert (view.near, view.far) == (2.0, 9.0)
+
+
+def test_llff_needs_a_row_per_photo(tmp_path: Path) -> None:
+    _photos(tmp_path / "images")
+    np.save(tmp_path / "poses_bounds.npy", np.stack([_llff_row(0, 30, 40, 35)] * 2))
+    with pytest.raises(UserError, match="holds 2 poses, but there are 3 photos"):
+        _find(tmp_path)
+    with pytest.raises(UserError, match="expected"):
+        np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 15)))
+        _find(tmp_path)
+
+
+def test_an_array_of_objects_is_not_unpickled(tmp_path: Path) -> None:
+    np.save(tmp_path / "p.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(UserError, match="not a readable array"):
+        read_poses_bounds(tmp_path / "p.npy", [])
+    with pytest.raises(UserError, match="not a readable array"):
+        read_rain_mask(tmp_path / "p.npy", 1)
+
+
+def _transforms(folder: Path, **more: Any) -> dict[str, Any]:
+    """A nerfstudio file of three cameras at x = 0, 1, 2, OpenGL axes (x right, y up, z back)."""
+    frames = []
+    for x, name in enumerate(NAMES):
+        matrix = np.diag([1.0, -1.0, -1.0, 1.0])  # looks along world +z, y down
+        matrix[0, 3] = x
+        frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
+    content = {"w": 80, "h": 60, "fl_x": 70.0, "fl_y": 72.0, "cx": 41.0, "cy": 29.0} | more
+    return content | {"frames": frames}
+
+
+def _write(folder: Path, content: dict[str, Any]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder / "transforms.json"
+
+
+def test_nerfstudio_axes_and_intrinsics_are_read(tmp_path: Path) -> None:
+    _photos(tmp_path / "images")
+    _write(tmp_path, _transforms(tmp_path, k1=0.1))
+    capture = _find(tmp_path)
+    assert capture.posed_by == "nerfstudio"
+    view = capture.views["c.png"].view("c.png", (40, 30))
+    expected = np.eye(4)
+    expected[0, 3] = -2.0
+    assert np.allclose(view.cam_from_world, expected)
+    assert (view.fx, view.fy, view.cx, view.cy, view.k1) == (35.0, 36.0, 20.5, 14.5, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR is not known"),
+        ({"w": 0}, "does not tell the photos' size"),
+        ({"frames": [{}]}, "not a list of posed photos"),
+        ({"fl_x": "wide"}, "not a list of posed photos"),
+    ],
+)
+def test_bad_transforms_are_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    _photos(tmp_path / "images")
+    with pytest.raises(UserError, match=message):
+        read_nerfstudio(_write(tmp_path, _transforms(tmp_path) | change))
+
+
+def test_a_pose_that_is_not_rigid_and_a_photo_that_is_not_there_are_named(tmp_path: Path) -> None:
+    _photos(tmp_path / "images")
+    content = _transforms(tmp_path)
+    content["frames"][1]["transform_matrix"][0][0] = 2.0
+    with pytest.raises(UserError, match=r"the pose of b\.jpg is not a rotation"):
+        read_nerfstudio(_write(tmp_path, content))
+    content = _transforms(tmp_path)
+    content["frames"][1]["file_path"] = "images/z.jpg"
+    with pytest.raises(UserError, match=r"names images/z\.jpg, which does not exist"):
+        read_nerfstudio(_write(tmp_path, content))
+    content = _transforms(tmp_path)
+    content["frames"][1]["mask_path"] = "images/a.jpg"
+    with pytest.raises(UserError, match=r"names no mask for a\.jpg, c\.jpg"):
+        read_nerfstudio(_write(tmp_path, content))
+
+
+def test_one_radial_term_is_carried_and_more_is_taken_away() -> None:
+    view = GivenView(Path("a"), np.eye(4), 400, 300, 300.0, 300.0, 200.0, 150.0)
+    assert view.carried
+
+    def bent(*distortion: float, fisheye: bool = False) -> GivenView:
+        return GivenView(
+            Path("a"), np.eye(4), 400, 300, 300.0, 300.0, 200.0, 150.0, distortion, fisheye
+        )
+
+    assert bent(0.1, 0.0, 0.0, 0.0).carried
+    assert not bent(0.1, 0.01).carried
+    assert not bent(0.6).carried, "k1 r^2 = 0.6 * 0.69 in the corner: rays would not be exact"
+    assert not bent(fisheye=True).carried
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_straightened_lines_are_where_a_pinhole_sees_them(fisheye: bool) -> None:
+    """A dot drawn where the bent camera sees a point must land where the straight one sees it."""
+    bent = GivenView(
+        Path("a"), np.eye(4), 400, 300, 300.0, 310.0, 203.0, 148.0, (-0.2, 0.05, 0.0, 0.0), fisheye
+    )
+    straight = straightened(bent)
+    assert not straight.distortion and not straight.fisheye
+    for x, y in ((0.3, 0.2), (-0.25, 0.1), (0.0, -0.3)):
+        r2 = x * x + y * y
+        if fisheye:
+            angle = np.arctan(np.sqrt(r2))
+            gain = angle * (1 - 0.2 * angle**2 + 0.05 * angle**4) / np.sqrt(r2)
+        else:
+            gain = 1 - 0.2 * r2 + 0.05 * r2**2
+        # Pixel indices: the centre of pixel (0, 0) lies at (0.5, 0.5).
+        column, row = 300.0 * x * gain + 203.0 - 0.5, 310.0 * y * gain + 148.0 - 0.5
+        rows, columns = np.mgrid[:300, :400]
+        dot = np.exp(-((columns - column) ** 2 + (rows - row) ** 2) / 8).astype(np.float32)
+        seen = Straightener(bent, straight)(np.repeat(dot[..., None], 3, axis=2))[..., 0]
+        total = seen.sum()
+        found = (seen * columns).sum() / total, (seen * rows).sum() / total
+        expected = straight.fx * x + straight.cx - 0.5, straight.fy * y + straight.cy - 0.5
+        assert found == pytest.approx(expected, abs=0.1)
+    white = Straightener(bent, straight)(np.ones((300, 400), np.uint8))
+    assert white.all(), "the straight picture is covered wholly"
+
+
+def test_rain_mask_has_the_official_layout_and_polarity(tmp_path: Path) -> None:
+    keep_masks = [np.ones((3, 5), bool) for _ in range(4)]
+    keep_masks[2][1, 4] = False
+    array = rain_mask(keep_masks)
+    assert array.shape == (3, 5, 4), "[H, W, N]"
+    assert array[1, 4, 2] == 1 and array.sum() == 1, "1 is a drop"
+    np.save(tmp_path / "rainMask.npy", array.astype(np.float32))
+    assert np.array_equal(read_rain_mask(tmp_path / "rainMask.npy", 4), np.stack(keep_masks))
+    with pytest.raises(UserError, match=r"\(height, width, 5\) is expected"):
+        read_rain_mask(tmp_path / "rainMask.npy", 5)
+    np.save(tmp_path / "rainMask.npy", array * 255)
+    with pytest.raises(UserError, match="outside 0"):
+        read_rain_mask(tmp_path / "rainMask.npy", 4)
+
+
+@pytest.mark.parametrize("white", [1, 255, 65535])
+def test_black_is_dropped_in_masks_of_other_programs(tmp_path: Path, white: int) -> None:
+    values = np.zeros((4, 6), np.uint16 if white > 255 else np.uint8)
+    values[:, 3:] = white
+    cv2.imwrite(str(tmp_path / "m.png"), values)
+    keep_mask = read_foreign_mask(tmp_path / "m.png")
+    assert keep_mask[:, 3:].all() and not keep_mask[:, :3].any()
+    cv2.imwrite(str(tmp_path / "rgb.png"), np.repeat(values[..., None], 3, axis=2))
+    assert np.array_equal(read_foreign_mask(tmp_path / "rgb.png"), keep_mask)
+
+
+def test_a_coloured_mask_is_refused_and_a_small_one_scaled(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4), "red").save(tmp_path / "m.png")
+    with pytest.raises(UserError, match="is coloured"):
+        read_foreign_mask(tmp_path / "m.png")
+    keep_mask = np.ones((4, 4), bool)
+    keep_mask[:2, :2] = False
+    assert fit_mask(keep_mask, (2, 2)).tolist() == [[False, True], [True, True]]
+
+
+def test_masks_are_found_by_any_usual_name_and_for_all_or_none(tmp_path: Path) -> None:
+    _photos(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in ("a.jpg.png", "b.jpg", "c.png"):
+        Image.new("L", (40, 30), 255).save(tmp_path / "masks" / name)
+    found = _find(tmp_path).masks
+    assert {name: path.name for name, path in found.items()} == {
+        "a.png": "a.jpg.png",
+        "b.png": "b.jpg",
+        "c.png": "c.png",
+    }
+    (tmp_path / "masks/b.jpg").unlink()
+    with pytest.raises(UserError, match=r"no mask for b\.png"):
+        _find(tmp_path)
+
+
+def test_a_video_stands_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").touch()
+    assert _find(tmp_path).video == tmp_path / "a.mp4"
+    _photos(tmp_path)
+    with pytest.raises(UserError, match=r"holds a\.mp4 and a\.jpg"):
+        _find(tmp_path)
+
+
+def test_adopting_copies_what_belongs_and_nothing_else(tmp_path: Path) -> None:
+    source, data = tmp_path / "capture", tmp_path / "data/garden"
+    _photos(source / "images")
+    _write(source, _transforms(source))
+    (source / "truth").mkdir()
+    (source / "truth/cameras.json").write_text("{}")
+    (source / "private.txt").write_text("not for you")
+    adopt(source, data, 3, _no_colmap)
+    files = {path.relative_to(data).as_posix() for path in data.rglob("*") if path.is_file()}
+    assert files == {*(f"images/{n}" for n in NAMES), "transforms.json", "truth/cameras.json"}
+    assert _find(data).posed_by == "nerfstudio"
+    with pytest.raises(UserError, match="exists already"):
+        adopt(source, data, 3, _no_colmap)
+
+
+def test_adopting_what_cannot_be_used_leaves_nothing(tmp_path: Path) -> None:
+    source, data = tmp_path / "capture", tmp_path / "data/garden"
+    _photos(tmp_path / "elsewhere")
+    content = _transforms(source)
+    for frame in content["frames"]:
+        frame["file_path"] = "../elsewhere/" + Path(frame["file_path"]).name
+    _write(source, content)
+    with pytest.raises(UserError, match="lies outside"):
+        adopt(source, data, 3, _no_colmap)
+    with pytest.raises(UserError, match="no folder and no video"):
+        adopt(tmp_path / "nothing", data, 3, _no_colmap)
+    assert not data.exists()

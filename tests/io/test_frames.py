@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.io.frames import choose, pick_frames, read_frames, save_frames
+from pipeline.io.images import image_size
+from pipeline.io.video import write_video
+
+# The display matrix of a track: 16.16 fixed point, the last column 2.30.
+UPRIGHT = "00010000 00000000 00000000 00000000 00010000 00000000 00000000 00000000 40000000"
+QUARTER = "00000000 00010000 00000000 ffff0000 00000000 00000000 00000000 00000000 40000000"
+
+
+def _pan() -> tuple[list[int], list[np.ndarray]]:
+    """A camera that rests, pans, rests, pans; every second frame is blurred. Places and frames."""
+    rng = np.random.default_rng(0)
+    wide = cv2.resize(
+        rng.random((60, 160, 3)).astype(np.float32), (1600, 600), interpolation=cv2.INTER_CUBIC
+    ).clip(0, 1)
+    places = [0] * 15 + list(range(0, 300, 12)) + [300] * 15 + list(range(300, 600, 12))
+    frames = []
+    for number, x in enumerate(places):
+        frame = wide[:240, x : x + 320]
+        frames.append(cv2.GaussianBlur(frame, (0, 0), 3) if number % 2 else frame)
+    return places, frames
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "pan.mp4"
+    write_video(path, _pan()[1], 24)
+    return path
+
+
+def test_frames_are_sharp_and_spread_over_the_way_not_over_time(video: Path) -> None:
+    places, _ = _pan()
+    chosen = pick_frames(video, 6)
+    assert [frame.index % 2 for frame in chosen] == [0] * 6, "the blurred ones are odd"
+    where = np.array([places[frame.index] for frame in chosen])
+    assert (np.diff(where) > 40).all() and (np.diff(where) < 160).all()
+    assert chosen[0].seconds == pytest.approx(chosen[0].index / 24, abs=2e-3)
+
+
+def test_the_sharpest_frame_in_the_middle_of_each_stretch() -> None:
+    # Two stretches of a way of 10: [0, 5) and [5, 10); middles [1, 4] and [6, 9].
+    way = np.array([0.0, 1.0, 2.0, 4.5, 5.0, 6.2, 8.0, 9.5, 10.0])
+    sharpness = np.array([9.0, 1.0, 2.0, 9.0, 9.0, 3.0, 2.0, 9.0, 9.0])
+    assert choose(way, sharpness, 2) == [2, 5]
+    assert choose(np.array([0.0, 0.0, 10.0]), np.ones(3), 2) == [0, 2], "a jump: what there is"
+
+
+def test_a_phone_held_upright_gives_upright_frames(video: Path, tmp_path: Path) -> None:
+    data = video.read_bytes()
+    place = data.index(bytes.fromhex(UPRIGHT), data.index(b"tkhd"))
+    turned = tmp_path / "turned.mp4"
+    turned.write_bytes(data[:place] + bytes.fromhex(QUARTER) + data[place + 36 :])
+    frame, pixels = next(read_frames(turned, pick_frames(turned, 3)))
+    # The matrix takes x (right) to y (down): a quarter clockwise.
+    expected = np.rot90(_pan()[1][frame.index], -1) * 255
+    assert pixels.shape == expected.shape
+    assert np.abs(pixels - expected).mean() < 10
+
+
+def test_saved_frames_are_numbered_and_tell_their_time(video: Path, tmp_path: Path) -> None:
+    records = save_frames(video, tmp_path, 5, 160)
+    assert [record.name for record in records] == [f"frame_{i:04d}.png" for i in range(5)]
+    assert {image_size(tmp_path / record.name) for record in records} == {(160, 120)}
+    assert records[0].source.startswith("pan.mp4 at ")
+
+
+def test_what_is_no_video_and_what_does_not_move_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("not a video")
+    with pytest.raises(UserError, match=r"text\.mp4 is not a video"):
+        pick_frames(tmp_path / "text.mp4", 5)
+    write_video(tmp_path / "still.mp4", [_pan()[1][0]] * 12, 24)
+    with pytest.raises(UserError, match=r"still\.mp4: the camera hardly moves"):
+        pick_frames(tmp_path / "still.mp4", 5)

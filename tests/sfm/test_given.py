@@ -1,0 +1,133 @@
+"""Poses that come along: read from a COLMAP model, kept to the last bit, points found for them."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import zlib  # noqa: F401
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.io.capture import find_capture
+from pipeline.io.images import write_image
+from pipeline.io.transforms import View
+from pipeline.sfm import Settings, read_colmap, triangulate
+
+WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
+SETTINGS = Settings(
+    camera="single",
+    matcher="exhaustive",
+    mapper="incremental",
+    max_features=800,
+    max_image_size=0,
+    masked=False,
+    still=False,
+    refine_focal=True,
+    refine_distortion=True,
+)
+
+
+def true_views(scene) -> dict[str, View]:
+    return {
+        name: View(
+            name, cam, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, 0.0, WIDTH, HEIGHT, 0.0, 0.0
+        )
+        for name, cam in scene.cams.items()
+    }  # fmt: skip
+
+
+def pass_on(scene, views, work, names=None):
+    names = names or scene.names
+    return triangulate(scene.images, None, names, views, work_dir=work, settings=SETTINGS)
+
+
+def test_given_poses_stay_and_points_tell_the_depths(scene, tmp_path):
+    views = true_views(scene)
+    found = pass_on(scene, views, tmp_path)
+    assert list(found.views) == scene.names
+    for name, view in found.views.items():
+        assert np.array_equal(view.cam_from_world, views[name].cam_from_world)
+        assert view.intrinsics == views[name].intrinsics
+        assert 2.9 * 0.6 < view.near < 2.9 and 5.0 < view.far < 5.0 * 1.6
+    assert found.reprojection_px < 0.5 and len(found.points_xyz) > 100
+    # The planes stand at 5, 3.6 and 2.9 metres along the world's z.
+    off = np.abs(found.points_xyz[:, 2:] - [[5.0, 3.6, 2.9]]).min(axis=1)
+    assert np.median(off) < 0.03
+
+
+def test_given_depths_stay_and_a_photo_without_a_pose_is_lost(scene, tmp_path):
+    views = {
+        name: dataclasses.replace(view, near=1.5, far=7.0)
+        for name, view in true_views(scene).items()
+        if name != "v2.png"
+    }
+    found = pass_on(scene, views, tmp_path)
+    assert {(view.near, view.far) for view in found.views.values()} == {(1.5, 7.0)}
+    assert [image.name for image in found.lost] == ["v2.png"]
+    assert "no pose" in str(found.lost[0])
+
+
+def test_poses_of_other_photos_are_refused(scene, tmp_path):
+    """Each camera stands opposite of where it stood: the matches meet behind them."""
+    views = true_views(scene)
+    for name, view in views.items():
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] *= -1
+        views[name] = dataclasses.replace(view, cam_from_world=pose)
+    with pytest.raises(UserError, match="do not fit them"):
+        pass_on(scene, views, tmp_path)
+
+
+def _model(folder: Path, scene, model: str, params: list[float]) -> pycolmap.Reconstruction:
+    made = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+    made.add_camera_with_trivial_rig(camera)
+    for number, name in enumerate(scene.names, start=1):
+        cam = scene.cams[name]
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(cam[:3, :3])), cam[:3, 3])
+        image = pycolmap.Image(name=f"sub/{name}", camera_id=1, image_id=number)
+        made.add_image_with_trivial_frame(image, rigid)
+    folder.mkdir(parents=True, exist_ok=True)
+    return made
+
+
+@pytest.mark.parametrize("form", ["text", "binary", "old binary"])
+def test_a_colmap_model_is_read_in_every_form(scene, tmp_path, form):
+    model = _model(tmp_path / "sparse/0", scene, "SIMPLE_RADIAL", [FOCAL, 120.0, 90.0, 0.02])
+    write = model.write_text if form == "text" else model.write_binary
+    write(str(tmp_path / "sparse/0"))
+    if form == "old binary":  # written before rigs and frames were thought of
+        for name in ("rigs.bin", "frames.bin"):
+            (tmp_path / "sparse/0" / name).unlink()
+    shutil.copytree(scene.images, tmp_path / "images")
+    capture = find_capture(tmp_path, 3, read_colmap)
+    assert capture.posed_by == "COLMAP" and list(capture.views) == scene.names
+    view = capture.views["v1.png"].view("v1.png", (WIDTH // 2, HEIGHT // 2))
+    assert np.allclose(view.cam_from_world, scene.cams["v1.png"], atol=1e-12)
+    assert view.intrinsics == (FOCAL / 2, FOCAL / 2, 60.0, 45.0, 0.02)
+
+
+def test_camera_models_keep_their_meaning(scene, tmp_path):
+    params = [220.0, 221.0, 120.0, 90.0, 0.1, 0.01, 0.002, 0.003]
+    _model(tmp_path, scene, "OPENCV", params).write_binary(str(tmp_path))
+    photos = [scene.images / name for name in scene.names]
+    view = read_colmap(tmp_path, photos)[0]
+    assert (view.fx, view.fy, view.cx, view.cy) == (220.0, 221.0, 120.0, 90.0)
+    assert view.distortion[:4] == (0.1, 0.01, 0.002, 0.003) and not view.carried
+    _model(tmp_path, scene, "FOV", [220.0, 221.0, 120.0, 90.0, 0.9]).write_binary(str(tmp_path))
+    with pytest.raises(UserError, match="the camera model FOV"):
+        read_colmap(tmp_path, photos)
+
+
+def test_a_model_of_other_photos_and_a_damaged_one_are_refused(scene, tmp_path):
+    _model(tmp_path, scene, "PINHOLE", [FOCAL, FOCAL, 120.0, 90.0]).write_binary(str(tmp_path))
+    write_image(tmp_path / "other.png", np.zeros((HEIGHT, WIDTH, 3)))
+    with pytest.raises(UserError, match="places none of the photos"):
+        read_colmap(tmp_path, [tmp_path / "other.png"])
+    (tmp_path / "images.bin").write_bytes(b"\x07\x00")
+    with pytest.raises(UserError, match="not a readable COLMAP model"):
+        read_colmap(tmp_path, [scene.images / "v0.png"])
