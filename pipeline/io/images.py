@@ -153,3 +153,12 @@ def resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         return pixels
     smaller = size[0] * size[1] < width * height
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+
+
+def shrink(pixels: np.ndarray, longest_side: int) -> np.ndarray:
+    """`pixels` scaled down by area averaging until no side exceeds `longest_side`; never enlarged."""
+    height, width = pixels.shape[:2]
+    factor = longest_side / max(height, width)
+    if factor >= 1.0:
+        return pixels
+    return resized(pixels, (max(1, round(width * factor)), max(1, round(height * factor))))
