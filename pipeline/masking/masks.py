@@ -114,4 +114,4 @@ def lens_fixedness(attentions: Sequence[np.ndarray], t: float) -> float:
         return 0.0
     # sum over pixels of ordered pairs of views in which both mark it / ordered pairs in which the first does
     agreement = float((votes * (votes - 1)).sum() / (votes.sum() * (count - 1)))
-    return (agreement - density) / (1.0 - density)
+    return float((agreement - density) / (1.0 - density))
