@@ -13,6 +13,7 @@ from ruamel.yaml import YAML, YAMLError
 from pipeline.errors import UserError
 
 STAGES = Path(__file__).resolve().parents[1] / "stages"
+CORRECT = "Correct it and run again."
 OTHER_SECTIONS = ("scene_defaults", "scenes", "variants", "comparisons")
 
 
@@ -36,32 +37,46 @@ def read_section(
     content = read_params(file)
     merged: dict[str, Any] = {}
     for where, values in _layers(file, content, name, scene, variant):
-        if not isinstance(values, Mapping):
-            raise UserError(f"{file.name}: {where} should hold key: value pairs.")
-        merged |= values
+        merged |= _mapping(file, where, values)
     try:
         return section_type.model_validate(merged)
     except pydantic.ValidationError as error:
         problems = [_sentence(name, problem, section_type) for problem in error.errors()]
-        raise UserError(
-            f"{file.name}: " + "; ".join(problems) + ".", f"Correct {file} and run again."
-        ) from None
+        raise UserError(f"{file.name}: " + "; ".join(problems) + ".", CORRECT) from None
 
 
 def read_params(file: Path) -> dict[str, Any]:
     """params.yaml as DVC reads it (YAML 1.2); UserError when missing, malformed or with unknown sections."""
     try:
         content = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{file} cannot be read ({error.strerror}).", "Check the file.") from None
     except (YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{file} is not valid YAML: {' '.join(str(error).split())}.") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{file} should hold sections of key: value pairs.")
+        raise UserError(f"{file} is not valid YAML{_place(error)}.", CORRECT) from None
+    content = _mapping(file, "the file", content)
     known = (*stage_names(), *OTHER_SECTIONS)
     _refuse_unknown(file, "section", content, known)
     for kind in ("scenes", "variants"):
-        for name, overrides in (content.get(kind) or {}).items():
-            _refuse_unknown(file, f"section in {kind}.{name}", overrides or {}, stage_names())
+        choices = _mapping(file, kind, content.get(kind) or {})
+        content[kind] = {str(name): values for name, values in choices.items()}
+        for name, values in content[kind].items():
+            overrides = _mapping(file, f"{kind}.{name}", values or {})
+            _refuse_unknown(file, f"section in {kind}.{name}", overrides, stage_names())
     return content
+
+
+def _place(error: Exception) -> str:
+    """Where in the file, and what is wrong there, as far as the parser knows."""
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    if mark is not None and problem:
+        return f", line {mark.line + 1}: {problem}"
+    return f": {str(error).splitlines()[0]}"
+
+
+def _mapping(file: Path, where: str, values: Any) -> dict[str, Any]:
+    if not isinstance(values, Mapping):
+        raise UserError(f"{file.name}: {where} should hold key: value pairs.", CORRECT)
+    return dict(values)
 
 
 def with_scene(file: Path, scene: str) -> str | None:
@@ -106,7 +121,7 @@ def _layers(
     file: Path, content: Mapping[str, Any], name: str, scene: str, variant: str | None
 ) -> Iterable[tuple[str, Any]]:
     if name not in content:
-        raise UserError(f"{file.name}: the section {name} is missing.")
+        raise UserError(f"{file.name}: the section {name} is missing.", CORRECT)
     yield name, content[name] or {}
     yield f"scenes.{scene}.{name}", _chosen(file, content, "scenes", scene).get(name) or {}
     if variant is not None:
@@ -130,7 +145,9 @@ def _refuse_unknown(file: Path, what: str, given: Mapping[str, Any], known: Iter
     known = list(known)
     for name in given:
         if name not in known:
-            raise UserError(f"{file.name}: unknown {what}: {name}.{_nearest(str(name), known)}")
+            raise UserError(
+                f"{file.name}: unknown {what}: {name}.{_nearest(str(name), known)}", CORRECT
+            )
 
 
 def _nearest(name: str, choices: Iterable[str]) -> str:

@@ -59,9 +59,11 @@ def test_every_problem_is_told_at_once_with_the_nearest_name(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("masks: [", "not valid YAML"),
-        ("- a\n- b", "sections of key: value"),
-        ("", "sections of key: value"),
+        ("a: 1\nmasks: [", "not valid YAML, line 2"),
+        ("- a\n- b", "the file should hold key: value"),
+        ("", "the file should hold key: value"),
+        ("scenes: [demo]\nmasks: {}", "scenes should hold key: value"),
+        ("scenes: {demo: 3}\nmasks: {}", "scenes.demo should hold key: value"),
         (GOOD.replace("\nmasks:", "\nmaskz:"), "unknown section: maskz. Did you mean masks?"),
         (GOOD.replace("tree: {masks", "tree: {mask"), "unknown section in scenes.tree: mask"),
         (GOOD.replace("threshold: 3e-1", "threshold: .nan"), "masks.threshold"),

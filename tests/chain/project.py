@@ -42,6 +42,11 @@ def copy_project(root: Path) -> None:
     """The project without its repository, data and results, with the scene `tiny` as its only one."""
     shutil.copytree(ROOT, root, ignore=LEFT_BEHIND)
     photograph(root / "data" / SCENE)
+    write_small_params(root)
+
+
+def write_small_params(root: Path) -> None:
+    """Puts the scene `tiny` into params.yaml in the demo's place, with little work to do."""
     text = YAML()
     params = text.load(root / "params.yaml")
     demo = {stage: dict(values) for stage, values in params["scenes"]["demo"].items()}
