@@ -57,7 +57,9 @@ def read_params(file: Path) -> dict[str, Any]:
     known = (*stage_names(), *OTHER_SECTIONS)
     _refuse_unknown(file, "section", content, known)
     for kind in ("scenes", "variants"):
-        choices = _mapping(file, kind, content.get(kind) or {})
+        if not content.get(kind):
+            continue
+        choices = _mapping(file, kind, content[kind])
         content[kind] = {str(name): values for name, values in choices.items()}
         for name, values in content[kind].items():
             overrides = _mapping(file, f"{kind}.{name}", values or {})

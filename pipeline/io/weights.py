@@ -27,9 +27,9 @@ def read_state(path: Path, hint: str = "") -> dict[str, Tensor]:
     if not path.is_file():
         raise UserError(f"The weights {path} do not exist.", hint)
     if path.suffix == ".safetensors":
-        state: Mapping[str, Any] = load_tensors(path)[0]
+        state: Mapping[str, Any] = load_tensors(path, hint)[0]
     elif path.suffix == ".npz":
-        state = _read_npz(path)
+        state = _read_npz(path, hint)
     else:
         state = _read_torch(path)
     named = {name.removeprefix("module."): value for name, value in state.items()}
@@ -40,12 +40,12 @@ def read_state(path: Path, hint: str = "") -> dict[str, Tensor]:
     }
 
 
-def _read_npz(path: Path) -> Mapping[str, Any]:
+def _read_npz(path: Path, hint: str) -> Mapping[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} is not an npz file of plain arrays ({error}).") from None
+        raise UserError(f"{path} is not an npz file of plain arrays ({error}).", hint) from None
 
 
 def _read_torch(path: Path) -> Mapping[str, Any]:

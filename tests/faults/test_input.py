@@ -68,6 +68,7 @@ def test_no_photo_in_a_jpg(photos: Workshop, content: bytes) -> None:
 
 
 def test_mixed_sizes(photos: Workshop) -> None:
+    photos.set("ingest", mixed_sizes="refuse")
     path = _photos(photos)[3]
     cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (200, 180)))
     photos.refuses("ingest", "mixed sizes", "8 of 240x180", "1 of 200x180", path.stem)

@@ -90,7 +90,9 @@ class Workshop:
         return sorted(
             str(path)
             for path in self.root.rglob("*")
-            if path.is_dir() and scratch not in (path, *path.parents) and path != scratch.parent
+            if path.is_dir()
+            and scratch not in path.parents
+            and path not in (scratch, scratch.parent, self.artifacts)
         )
 
 
