@@ -19,15 +19,9 @@ from pipeline.parallel import cores
 from pipeline.stage import Job, Section, run
 
 SETTINGS = {
-    "space",
-    "seed",
-    "resolution",
-    "samples",
-    "levels",
-    "features",
-    "table_log2",
-    "distortion",
-}
+    "space", "seed", "resolution", "samples", "levels", "features", "table_log2", "distortion",
+    "trim",
+}  # fmt: skip
 
 
 class Params(Section):
@@ -46,6 +40,8 @@ class Params(Section):
     table_log2: Annotated[int, Field(ge=10, le=22)]
     resolution: Annotated[int, Field(ge=32, le=8192)]
     distortion: Annotated[float, Field(ge=0, le=1)]
+    trim: Annotated[float, Field(ge=0, le=0.5)]
+    rate: Annotated[float, Field(gt=0, le=10)]
     far_factor: Annotated[float, Field(ge=1, le=100)]
     save_every: Annotated[int, Field(ge=1)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -100,6 +96,7 @@ def _fit(
             steps=steps,
             batch_rays=params.paper_batch_rays if paper else params.batch_rays,
             seed=params.seed,
+            rate=params.rate,
             shards=2 if job.device == "cpu" else 1,
             threads=cores(),
             save_every=params.save_every,

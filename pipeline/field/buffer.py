@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,10 @@ from pipeline.io.posed import PosedImage
 @dataclass(frozen=True)
 class PosedPhoto:
     """One photo to fit: ``image`` ``(H, W, 3)`` in [0, 1], ``keep_mask`` ``(H, W)`` True = use,
-    ``cam_from_world`` ``(4, 4)``, ``intrinsics`` fx, fy, cx, cy, k1, and its depth bounds."""
+    ``cam_from_world`` ``(4, 4)``, ``intrinsics`` fx, fy, cx, cy, k1, and its depth bounds.
+
+    ``drop_mask`` ``(H, W)`` in [0, 1], if there is one, weighs kept pixels down: the loss's soft M.
+    """
 
     name: str
     image: np.ndarray
@@ -27,6 +31,17 @@ class PosedPhoto:
     intrinsics: tuple[float, float, float, float, float]
     near: float
     far: float
+    drop_mask: np.ndarray | None = None
+
+
+class Batch(NamedTuple):
+    """``rays``, their colours ``observed`` ``(R, 3)`` in [0, 1], the loss's ``drop_mask`` ``(R,)``
+    and the number ``view`` ``(R,)`` of the photo that each belongs to."""
+
+    rays: Rays
+    observed: Tensor
+    drop_mask: Tensor
+    view: Tensor
 
 
 def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list[PosedPhoto]:
@@ -55,7 +70,7 @@ def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list
 class RayBuffer:
     """Every kept pixel of every photo, in an order shuffled anew each epoch.
 
-    Covered pixels are not in it, so no ray is wasted on them. Holds 7 bytes per pixel; the rays
+    Covered pixels are not in it, so no ray is wasted on them. Holds 12 bytes per pixel; the rays
     are made when a batch is asked for.
     """
 
@@ -83,11 +98,12 @@ class RayBuffer:
         self._poses = _stack([p.cam_from_world[:3, :4] for p in photos])
         self._intrinsics = _stack([np.array(p.intrinsics) for p in photos])
         self._bounds = _stack([np.array([p.near, p.far]) for p in photos])
+        self._soft = _soft_masks(photos, device)
         self._epoch = -1
         self._shuffled = self._kept
 
-    def batch(self, step: int, size: int) -> tuple[Rays, Tensor]:
-        """The ``size`` rays of a step and their colours ``(R, 3)``; fewer if fewer are kept."""
+    def batch(self, step: int, size: int) -> Batch:
+        """The ``size`` rays of a step; fewer if fewer are kept."""
         size = min(size, self.count)
         epoch, place = divmod(step, self.count // size)
         if epoch != self._epoch:
@@ -103,7 +119,23 @@ class RayBuffer:
         rays_o, rays_d = pixel_rays(columns, rows, self._intrinsics[view], self._poses[view])
         near, far = self._bounds[view].unbind(-1)
         rays = Rays(*(v.to(self.device) for v in (rays_o, rays_d, near, far)))
-        return rays, self._colours[pixel.to(self.device)].float() / 255.0
+        pixel, view = pixel.to(self.device), view.to(self.device)
+        observed = self._colours[pixel].float() / 255.0
+        drop_mask = torch.zeros(size, device=self.device)
+        if self._soft is not None:
+            drop_mask = self._soft[pixel].float() / 255.0
+        return Batch(rays, observed, drop_mask, view)
+
+
+def _soft_masks(photos: Sequence[PosedPhoto], device: str) -> Tensor | None:
+    if all(photo.drop_mask is None for photo in photos):
+        return None
+    soft = [
+        np.zeros(photo.keep_mask.shape) if photo.drop_mask is None else photo.drop_mask
+        for photo in photos
+    ]
+    bytes_ = [np.round(np.clip(mask, 0.0, 1.0).ravel() * 255.0).astype(np.uint8) for mask in soft]
+    return torch.from_numpy(np.concatenate(bytes_)).to(device)
 
 
 def _stack(arrays: list[np.ndarray]) -> Tensor:

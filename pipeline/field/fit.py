@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from pipeline.errors import UserError
 from pipeline.field.base import Field, Part, Rays
-from pipeline.field.buffer import RayBuffer
+from pipeline.field.buffer import Batch, RayBuffer
 from pipeline.field.encoding import RowGradient, add_rows
 
 log = logging.getLogger(__name__)
@@ -41,17 +41,20 @@ class Record:
 class Stepper:
     """Adam for one part of a field, at a rate that depends on the step alone."""
 
-    def __init__(self, part: Part, parameters: list[nn.Parameter], steps: int) -> None:
+    def __init__(
+        self, part: Part, parameters: list[nn.Parameter], steps: int, rate: float = 1.0
+    ) -> None:
         self.part, self.parameters, self.steps = part, parameters, steps
+        self.rate = part.rate * rate
         self.adam = torch.optim.Adam(
-            parameters, lr=part.rate, betas=part.betas, eps=part.eps, fused=True
+            parameters, lr=self.rate, betas=part.betas, eps=part.eps, fused=True
         )
 
     def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
         """One step with the given gradients; none at all leaves the part as it is."""
         if all(gradient is None for gradient in gradients):
             return
-        rate = self.part.rate * self.part.final ** (step / self.steps)
+        rate = self.rate * self.part.final ** (step / self.steps)
         if self.part.warmup:
             rate *= min(1.0, (step + 1) / self.part.warmup)
         self.adam.param_groups[0]["lr"] = rate
@@ -84,6 +87,7 @@ def fit(
     steps: int,
     batch_rays: int,
     seed: int,
+    rate: float = 1.0,
     shards: int = 2,
     threads: int = 2,
     log_every: int = 50,
@@ -95,11 +99,12 @@ def fit(
     """Fit ``model`` (a :class:`Field`) in place; the course of it comes out.
 
     ``shards`` pieces of each batch run side by side on up to ``threads`` cores: the shards decide
-    the bytes, the threads do not. ``save(step, state)`` is called every ``save_every`` steps;
+    the bytes, the threads do not. ``rate`` multiplies every learning rate.
+    ``save(step, state)`` is called every ``save_every`` steps;
     ``resume`` takes such a pair and goes on to the same bytes. ``progress(step, loss, psnr)``.
     Raises UserError when the loss is not finite.
     """
-    steppers = _steppers(model, steps)
+    steppers = _steppers(model, steps, rate)
     record = Record()
     running: list[Tensor] = []
     first = 0
@@ -108,8 +113,8 @@ def fit(
         running = list(resume[1]["running"])
     with _pool(threads, buffer.device) as pool:
         for step in range(first, steps):
-            rays, observed = buffer.batch(step, batch_rays)
-            losses = _one_step(model, steppers, rays, observed, step, seed, shards, pool)
+            batch = buffer.batch(step, batch_rays)
+            losses = _one_step(model, steppers, batch, step, seed, shards, pool)
             running.append(losses)
             done = step + 1
             if done % log_every == 0 or done == steps:
@@ -128,8 +133,7 @@ def fit(
 def _one_step(
     model: nn.Module,
     steppers: list[Stepper],
-    rays: Rays,
-    observed: Tensor,
+    batch: Batch,
     step: int,
     seed: int,
     shards: int,
@@ -141,17 +145,18 @@ def _one_step(
         for stepper in steppers
         for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
     ]
-    pieces = _cut(rays, observed, shards)
-    total = observed.shape[0]
+    pieces = _cut(batch, shards)
+    total = batch.observed.shape[0]
 
     def shard(number: int) -> tuple[Tensor, dict[str, Tensor | None], list[RowGradient]]:
-        piece, colours = pieces[number]
-        share = colours.shape[0] / total
-        source = torch.Generator(colours.device)
+        piece = pieces[number]
+        share = piece.observed.shape[0] / total
+        source = torch.Generator(piece.observed.device)
         source.manual_seed((seed * 1_000_003 + step) * 64 + number)
         sink: list[RowGradient] = []
-        keep_all = torch.zeros(colours.shape[0], device=colours.device)
-        loss, photometric = _as_field(model).loss(piece, colours, keep_all, step, source, sink)
+        loss, photometric = _as_field(model).loss(
+            piece.rays, piece.observed, piece.drop_mask, step, source, sink
+        )
         gradients = torch.autograd.grad(
             loss * share, [parameter for _, parameter in dense], allow_unused=True
         )
@@ -192,12 +197,13 @@ def _total(
     return torch.stack(found).sum(0) if found else None
 
 
-def _cut(rays: Rays, observed: Tensor, shards: int) -> list[tuple[Rays, Tensor]]:
+def _cut(batch: Batch, shards: int) -> list[Batch]:
     """The batch in ``shards`` nearly equal pieces, none empty."""
-    cuts = [t.chunk(shards, dim=-1) for t in rays]
+    rays = zip(*(part.chunk(shards, dim=-1) for part in batch.rays), strict=True)
+    rest = (part.chunk(shards, dim=0) for part in batch[1:])
     return [
-        (Rays(*(c[i].contiguous() for c in cuts)), colours)
-        for i, colours in enumerate(observed.chunk(shards, dim=0))
+        Batch(Rays(*(part.contiguous() for part in piece)), *others)
+        for piece, *others in zip(rays, *rest, strict=True)
     ]
 
 
@@ -229,20 +235,20 @@ def _as_field(model: nn.Module) -> Field:
     return model  # type: ignore[return-value]
 
 
-def _steppers(model: nn.Module, steps: int) -> list[Stepper]:
+def _steppers(model: nn.Module, steps: int, rate: float) -> list[Stepper]:
     named = dict(model.named_parameters())
     parts = _as_field(model).parts()
     listed = sorted(name for part in parts for name in part.parameters)
     if listed != sorted(named):
         raise ValueError("every parameter of a field must be in exactly one part")
-    return [Stepper(part, [named[name] for name in part.parameters], steps) for part in parts]
+    return [Stepper(part, [named[name] for name in part.parameters], steps, rate) for part in parts]
 
 
 def _check_finite(loss: float, step: int) -> None:
     if not math.isfinite(loss):
         raise UserError(
             f"The fit broke down near step {step}: its loss is {loss}.",
-            hint="lower nerf.rate, or change nerf.seed",
+            hint="Lower nerf.rate (0.5, say), or change nerf.seed.",
         )
 
 

@@ -38,6 +38,7 @@ class GridConfig:
     bins: int = 32
     proposal: tuple[int, int, int] = (96, 72, 64)
     distortion: float = 0.0
+    trim: float = 0.0
 
 
 class GridField(nn.Module):
@@ -83,6 +84,8 @@ class GridField(nn.Module):
         out = self._shade(rays, proposed.detach(), generator, sink)
         photometric = masked_photometric_loss(out.rgb, observed, drop_mask)
         total = photometric
+        if self.config.trim > 0.0 and step >= 200:
+            total = masked_photometric_loss(out.rgb, observed, drop_mask, self.config.trim)
         if learn_proposal:
             total = total + proposal_loss(out.edges, out.weights, proposed)
         if self.config.distortion > 0.0:

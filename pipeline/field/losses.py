@@ -6,17 +6,26 @@ import torch
 from torch import Tensor
 
 
-def masked_photometric_loss(rendered: Tensor, observed: Tensor, drop_mask: Tensor) -> Tensor:
+def masked_photometric_loss(
+    rendered: Tensor, observed: Tensor, drop_mask: Tensor, trim: float = 0.0
+) -> Tensor:
     """Mean squared colour error over the rays that count (eq. 4 of the paper, normalised).
 
     ``rendered`` and ``observed`` ``(R, 3)``; ``drop_mask`` ``(R,)`` is the paper's M: 1 on a drop,
     0 elsewhere, soft values between them weigh a ray down. The paper sums over rays; here the sum
     is divided by three times the rays that count, so the step does not shrink with the coverage.
-    No ray that counts gives 0.
+    No ray that counts gives 0. ``trim`` leaves out that share of the rays: those that are farthest
+    off, which may be water that no mask covers (least trimmed squares, doi:10.2307/2288718).
     """
     keep = 1.0 - drop_mask.to(rendered.dtype)
-    error = ((rendered - observed) * keep[:, None]).square().sum()
-    return error / (3.0 * keep.square().sum()).clamp_min(1e-12)
+    error = ((rendered - observed) * keep[:, None]).square().sum(1)
+    weight = keep.square()
+    if trim > 0.0:
+        used = max(1, round(error.shape[0] * (1.0 - trim)))
+        limit = error.detach().kthvalue(used).values
+        weight = torch.where(error.detach() <= limit, weight, 0.0)
+        error = torch.where(error.detach() <= limit, error, 0.0)
+    return error.sum() / (3.0 * weight.sum()).clamp_min(1e-12)
 
 
 def proposal_loss(

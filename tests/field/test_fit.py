@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from pipeline.errors import UserError
-from pipeline.field.buffer import PosedPhoto, RayBuffer
+from pipeline.field.buffer import Batch, PosedPhoto, RayBuffer
 from pipeline.field.fit import fit
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.model import describe, restore, scene_space
 from pipeline.field.render import render_view
+from pipeline.field.store import Checkpoint
 
 sys.path.insert(0, str(Path(__file__).parent))
 from scene import camera, photograph
 
+ROOT = Path(__file__).resolve().parents[2]
 SIZE, FOCAL, NEAR, FAR = (40, 30), 38.0, 2.5, 20.0
 INTRINSICS = (FOCAL, FOCAL, 20.0, 15.0, 0.0)
 SMALL = GridConfig(
@@ -106,19 +110,63 @@ def test_same_seed_same_bytes_for_one_thread_and_two(photos: list[PosedPhoto]) -
     assert not same(models[0], models[2])
 
 
-def test_a_resumed_fit_ends_with_the_same_bytes(photos: list[PosedPhoto]) -> None:
-    saved: list[tuple[int, dict[str, torch.Tensor]]] = []
+class Killed(Exception):
+    pass
 
-    def save(step: int, state: dict[str, torch.Tensor]) -> None:
-        saved.append((step, {name: value.clone() for name, value in state.items()}))
 
-    how = {"steps": 12, "batch_rays": 256, "seed": 3, "log_every": 5}
-    whole, later = field(photos), field(photos, seed=99)
-    first = fit(whole, RayBuffer(photos, 0), save_every=7, save=save, **how)
-    second = fit(later, RayBuffer(photos, 0), resume=saved[0], **how)
-    assert saved[0][0] == 7
+@pytest.mark.parametrize("at", [1, 7, 8, 11])
+def test_a_fit_killed_at_any_step_ends_with_the_same_bytes(
+    photos: list[PosedPhoto], tmp_path: Path, at: int
+) -> None:
+    """The process dies after step ``at``, a checkpoint every third step lies on disk; run again."""
+    how = {"steps": 12, "batch_rays": 256, "seed": 3, "log_every": 5, "save_every": 3}
+    checkpoint = Checkpoint(tmp_path / "checkpoint.safetensors", "key")
+    whole, dying, later = field(photos), field(photos), field(photos, seed=99)
+    first = fit(whole, RayBuffer(photos, 0), **how)
+    fatal = RayBuffer(photos, 0)
+    draw = fatal.batch
+
+    def batch(step: int, size: int) -> Batch:
+        if step == at:
+            raise Killed
+        return draw(step, size)
+
+    fatal.batch = batch  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        fit(dying, fatal, save=checkpoint.save, **how)
+    resume = checkpoint.load()
+    assert (resume[0] if resume else 0) == at // 3 * 3
+    if resume is None:
+        later = field(photos)
+    second = fit(later, RayBuffer(photos, 0), resume=resume, **how)
     assert same(whole, later)
     assert first.rows == second.rows
+
+
+def test_soft_masks_reach_the_loss(photos: list[PosedPhoto]) -> None:
+    """Fully soft-masked photos teach nothing about colour: grey noise there leaves the fit alone."""
+    soft = np.zeros((30, 40), np.float32)
+    soft[:, 20:] = 1.0
+    models = []
+    for value in (0.0, 1.0):
+        marked = []
+        for photo in photos:
+            image = photo.image.copy()
+            image[:, 20:] = value
+            marked.append(PosedPhoto(**{**vars(photo), "image": image, "drop_mask": soft}))
+        models.append(field(photos))
+        fit(models[-1], RayBuffer(marked, 0), steps=6, batch_rays=256, seed=0)
+    assert same(*models)
+
+
+def test_the_rate_scales_every_step(photos: list[PosedPhoto]) -> None:
+    """Adam's first step moves every parameter that has a gradient by its rate."""
+    moved = []
+    for rate in (1.0, 0.25):
+        model, start = field(photos), field(photos)
+        fit(model, RayBuffer(photos, 0), steps=1, batch_rays=256, seed=0, rate=rate)
+        moved.append((model.colour_out.bias - start.colour_out.bias).abs().max().item())
+    assert moved[1] == pytest.approx(moved[0] / 4, rel=1e-3)
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_and_knob(photos: list[PosedPhoto]) -> None:
@@ -127,4 +175,6 @@ def test_a_loss_that_is_not_finite_stops_with_step_and_knob(photos: list[PosedPh
         model.colour_out.bias.fill_(float("nan"))
     with pytest.raises(UserError, match="near step 4") as caught:
         fit(model, RayBuffer(photos, 0), steps=20, batch_rays=256, seed=0, log_every=5)
-    assert "nerf." in caught.value.hint
+    knobs = re.findall(r"nerf\.(\w+)", caught.value.hint)
+    known = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
+    assert knobs and all(knob in known for knob in knobs)

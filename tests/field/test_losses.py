@@ -25,6 +25,24 @@ def test_nothing_flows_into_a_covered_ray() -> None:
     assert rendered.grad[drop_mask == 0].abs().min() > 0
 
 
+def test_soft_masks_weigh_rays_down() -> None:
+    rendered = torch.tensor([[0.4, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    # Half covered: (0.5 * 0.4)^2 = 0.04, over 3 * (0.5^2 + 1^2) = 3.75.
+    loss = masked_photometric_loss(rendered, torch.zeros(2, 3), torch.tensor([0.5, 0.0]))
+    assert float(loss) == pytest.approx(0.04 / 3.75)
+
+
+def test_trimming_leaves_the_farthest_rays_out() -> None:
+    rendered = torch.tensor([[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0], [0.9, 0, 0]])
+    drop_mask = torch.zeros(4)
+    # A quarter left out: 0.01 + 0.04 + 0.09 = 0.14, over the 3 rays' 9 numbers.
+    loss = masked_photometric_loss(rendered, torch.zeros(4, 3), drop_mask, trim=0.25)
+    assert float(loss) == pytest.approx(0.14 / 9)
+    grown = rendered.clone().requires_grad_()
+    masked_photometric_loss(grown, torch.zeros(4, 3), drop_mask, trim=0.25).backward()
+    assert grown.grad[3].abs().max() == 0 and grown.grad[2, 0] > 0
+
+
 def test_all_covered_gives_zero_and_no_nan() -> None:
     assert float(masked_photometric_loss(torch.ones(2, 3), torch.zeros(2, 3), torch.ones(2))) == 0
 

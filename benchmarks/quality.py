@@ -1,0 +1,219 @@
+"""What a fit loses to drops, masks and poses: held-out PSNR of one scene under several inputs.
+
+    python -m benchmarks.quality data/demo
+    python -m benchmarks.quality data/demo --rows clean,true --steps 3000 --set samples=12
+
+A scene is a folder with photos and `truth/` (`clean/`, `coverage/`, `cameras.json`, perhaps
+`depth/`), as `synthesize` makes it. Estimated poses and the detector's masks are read from
+`artifacts/<scene>/` where they exist. Every eighth view is held out and compared with its clean
+reference; settings are those of params.yaml. *seen*: the pixels whose surface at least three fitted
+photos show without a drop, by the depth of the clean fit; the oracle gap is the loss against the
+clean photos with the same poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import yaml
+
+from pipeline.field.buffer import PosedPhoto, RayBuffer
+from pipeline.field.fit import fit
+from pipeline.field.model import build_around
+from pipeline.field.render import RenderedView, render_view
+from pipeline.field.visibility import Witness, witness_count
+from pipeline.geometry.poses import align_cameras
+from pipeline.io.atomic import read_json
+from pipeline.io.images import read_image
+from pipeline.io.maps import read_depth
+from pipeline.io.masks import read_keep_mask
+from pipeline.io.transforms import View, read_transforms
+
+ROOT = Path(__file__).resolve().parents[1]
+# A faintly wet pixel hurts, a clean one thrown away costs: the true masks end where the water ends.
+TRUE_COVERAGE = 0.02
+ROWS = {
+    "clean": ("clean", "none", "true"),
+    "none": ("rainy", "none", "true"),
+    "true": ("rainy", "true", "true"),
+    "clean-sfm": ("clean", "none", "sfm"),
+    "true-sfm": ("rainy", "true", "sfm"),
+    "detector-sfm": ("rainy", "detector", "sfm"),
+}
+FIELD = ("samples", "levels", "features", "table_log2", "distortion", "resolution", "seed", "space")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Photos, references and cameras of a scene, by the photos' stems, in name order."""
+
+    rainy: dict[str, np.ndarray]
+    clean: dict[str, np.ndarray]
+    coverage: dict[str, np.ndarray]
+    detected: dict[str, np.ndarray]
+    views: dict[str, dict[str, View]]  # poses "true" and, if there are any, "sfm"
+
+
+class Result(NamedTuple):
+    """Held-out PSNR of the whole image and of the seen pixels; renderings of every view."""
+
+    psnr: float
+    seen: float
+    seconds: float
+    renders: dict[str, RenderedView]
+
+
+def load(folder: Path, artifacts: Path) -> Scene:
+    """The scene in ``folder``, with masks and poses from ``artifacts`` if there are any."""
+    photos = {p.stem: p for p in sorted(folder.glob("*.[jp][pn]g"))}
+    rainy = {stem: read_image(path) for stem, path in photos.items()}
+    truth = folder / "truth"
+    clean = {stem: read_image(next((truth / "clean").glob(f"{stem}.*"))) for stem in photos}
+    coverage = {}
+    for stem in photos:
+        raw = cv2.imread(str(truth / "coverage" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+        coverage[stem] = raw.astype(np.float32) / np.iinfo(raw.dtype).max
+    poses = artifacts / "poses" / "transforms.json"
+    sfm = {Path(n).stem: v for n, v in read_transforms(poses).items()} if poses.is_file() else {}
+    detected = {
+        stem: read_keep_mask(artifacts / "masks" / f"{stem}.png")
+        for stem in photos
+        if (artifacts / "masks" / f"{stem}.png").is_file()
+    }
+    views = {"true": _true_views(truth, list(photos), sfm)} | ({"sfm": sfm} if sfm else {})
+    return Scene(rainy, clean, coverage, detected, views)
+
+
+def _true_views(truth: Path, stems: list[str], sfm: dict[str, View]) -> dict[str, View]:
+    about = read_json(truth / "cameras.json")
+    cams = {stem: np.array(about["frames"][stem]["cam_from_world"]) for stem in stems}
+    if sfm:
+        scale = align_cameras({s: v.cam_from_world for s, v in sfm.items()}, cams).scale
+        near = scale * min(view.near for view in sfm.values())
+        far = scale * max(view.far for view in sfm.values())
+    else:
+        maps = [read_depth(truth / "depth" / f"{stem}.exr")[::8, ::8].ravel() for stem in stems]
+        depth = np.concatenate(maps)
+        near, far = np.quantile(depth[np.isfinite(depth) & (depth > 0)], (0.001, 0.97))
+        near, far = 0.85 * near, 1.5 * far
+    camera = (about["fx"], about["fy"], about["cx"], about["cy"], 0.0)
+    size = (about["width"], about["height"])
+    return {s: View(s, cam, *camera, *size, float(near), float(far)) for s, cam in cams.items()}
+
+
+def measure(
+    scene: Scene, row: str, settings: dict[str, Any], threads: int, seen: dict[str, np.ndarray]
+) -> Result:
+    """Fit one row's input and compare the held-out views; ``seen`` masks by stem, may be empty."""
+    kind, masks, poses = ROWS[row]
+    views = scene.views[poses]
+    near = min(view.near for view in views.values())
+    far = max(view.far for view in views.values()) * settings["far_factor"]
+    stems = [stem for stem in scene.rainy if stem in views]
+    held_out = [stem for i, stem in enumerate(scene.rainy) if i % 8 == 0 and stem in views]
+    photos = []
+    for stem in stems:
+        if stem in held_out:
+            continue
+        image = (scene.clean if kind == "clean" else scene.rainy)[stem]
+        keep_mask = np.ones(image.shape[:2], bool)
+        if masks == "true":
+            keep_mask = scene.coverage[stem] <= TRUE_COVERAGE
+        elif masks == "detector":
+            keep_mask = scene.detected[stem]
+        view = views[stem]
+        photos.append(
+            PosedPhoto(stem, image, keep_mask, view.cam_from_world, view.intrinsics, near, far)
+        )
+    config = {key: settings[key] for key in FIELD}
+    field = build_around("fast", list(views.values()), near, far, **config)
+    buffer = RayBuffer(photos, settings["seed"])
+    begin = time.perf_counter()
+    fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
+        seed=settings["seed"], threads=threads)  # fmt: skip
+    seconds = time.perf_counter() - begin
+    torch.set_num_threads(threads)
+    renders = {}
+    for stem in stems if not seen else held_out:
+        view = views[stem]
+        size = (view.width, view.height)
+        renders[stem] = render_view(field, view.cam_from_world, view.intrinsics, size, near, far)
+    errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
+    whole = np.mean([_psnr(error) for error in errors.values()])
+    inside = [_psnr(errors[stem][seen[stem]]) for stem in held_out] if seen else [np.nan]
+    return Result(float(whole), float(np.mean(inside)), seconds, renders)
+
+
+def seen_pixels(
+    scene: Scene, renders: dict[str, RenderedView], fewest: int = 3
+) -> dict[str, np.ndarray]:
+    """By stem, which pixels show a surface that at least ``fewest`` fitted photos saw uncovered."""
+    views = scene.views["true"]
+
+    def witness(stem: str) -> Witness:
+        view, keep_mask = views[stem], scene.coverage[stem] <= TRUE_COVERAGE
+        return Witness(view.cam_from_world, view.intrinsics, keep_mask, renders[stem].depth)
+
+    names = list(scene.rainy)
+    train = [witness(stem) for i, stem in enumerate(names) if i % 8]
+    out = {}
+    for stem in names[::8]:
+        count = witness_count(witness(stem), train)
+        height, width = scene.coverage[stem].shape
+        out[stem] = np.repeat(np.repeat(count >= fewest, 2, 0), 2, 1)[:height, :width]
+    return out
+
+
+def _psnr(squares: np.ndarray) -> float:
+    return float(-10.0 * np.log10(squares.mean()))
+
+
+def main() -> None:
+    """Print one table per scene."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders like data/demo")
+    parser.add_argument("--artifacts", type=Path, default=ROOT / "artifacts")
+    parser.add_argument("--rows", default=",".join(ROWS))
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--steps", type=int, help="instead of params.yaml's")
+    parser.add_argument("--set", nargs="*", default=[], help="other parameters, key=value")
+    flags = parser.parse_args()
+    settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
+    settings |= {pair.split("=")[0]: yaml.safe_load(pair.split("=")[1]) for pair in flags.set}
+    settings["steps"] = flags.steps or settings["steps"]
+    for folder in flags.scenes:
+        scene = load(folder, flags.artifacts / folder.name)
+        covered = np.mean([c > TRUE_COVERAGE for c in scene.coverage.values()])
+        print(f"{folder.name}: {len(scene.rainy)} views, {covered:.1%} covered, "
+              f"{settings['steps']} steps of {settings['batch_rays']} rays")  # fmt: skip
+        print(f"{'photos':6} {'masks':8} {'poses':5} {'PSNR':>6} {'gap':>6} {'seen':>6} "
+              f"{'gap':>6} {'fit s':>6}", flush=True)  # fmt: skip
+        seen: dict[str, np.ndarray] = {}
+        clean: dict[str, Result] = {}
+        for row in flags.rows.split(","):
+            kind, masks, poses = ROWS[row]
+            if poses not in scene.views or (masks == "detector" and not scene.detected):
+                continue
+            result = measure(scene, row, settings, flags.threads, seen)
+            if kind == "clean":
+                if not seen:
+                    seen = seen_pixels(scene, result.renders)
+                    errors = {s: (result.renders[s].rgb - scene.clean[s]) ** 2 for s in seen}
+                    inside = [_psnr(errors[s][seen[s]]) for s in seen]
+                    result = result._replace(seen=float(np.mean(inside)))
+                clean[poses] = result
+            best = clean.get(poses)
+            gaps = (best.psnr - result.psnr, best.seen - result.seen) if best else (np.nan,) * 2
+            print(f"{kind:6} {masks:8} {poses:5} {result.psnr:6.2f} {gaps[0]:6.2f} "
+                  f"{result.seen:6.2f} {gaps[1]:6.2f} {result.seconds:6.1f}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
