@@ -42,6 +42,7 @@ class Params(Section):
     distortion: Annotated[float, Field(ge=0, le=1)]
     trim: Annotated[float, Field(ge=0, le=0.5)]
     rate: Annotated[float, Field(gt=0, le=10)]
+    exposure: bool
     far_factor: Annotated[float, Field(ge=1, le=100)]
     save_every: Annotated[int, Field(ge=1)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -68,6 +69,7 @@ def main(job: Job, params: Params) -> str:
         "use_masks": params.use_masks,
         "rays": buffer.count,
         "photos": [photo.name for photo in photos],
+        "gains": None if record.gains is None else record.gains.tolist(),
     }
     with publish_dir(job.paths.nerf) as fresh:
         save_field(fresh, field, near, far, about)
@@ -97,6 +99,7 @@ def _fit(
             batch_rays=params.paper_batch_rays if paper else params.batch_rays,
             seed=params.seed,
             rate=params.rate,
+            exposure=params.exposure,
             shards=2 if job.device == "cpu" else 1,
             threads=cores(),
             save_every=params.save_every,

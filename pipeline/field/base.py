@@ -69,8 +69,12 @@ class Field(Protocol):
         step: int,
         generator: torch.Generator,
         sink: list[RowGradient],
+        gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """The loss to descend, and the plain photometric loss (eq. 4) within it."""
+        """The loss to descend, and the plain photometric loss (eq. 4) within it.
+
+        ``gain`` ``(R, 3)`` multiplies the rendered colours: the exposure of each ray's photo.
+        """
 
     def parts(self) -> list[Part]:
         """How each parameter is to be stepped; every parameter is in one part."""

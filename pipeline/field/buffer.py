@@ -89,7 +89,7 @@ class RayBuffer:
                 hint="raise masks.threshold or lower masks.dilation",
             )
         self.seed, self.device = seed, device
-        self.count = int(order.size)
+        self.count, self.photos = int(order.size), len(photos)
         self._kept = torch.from_numpy(order)
         self._colours = torch.from_numpy(np.concatenate(colours)).to(device)
         self._offsets = torch.tensor(offsets[1:])

@@ -36,6 +36,26 @@ class Record:
     """The course of a fit: step, loss and training PSNR in dB, averaged since the row before."""
 
     rows: list[tuple[int, float, float]] = field(default_factory=list)
+    gains: Tensor | None = None
+
+
+class Exposure(nn.Module):
+    """One factor per photo and channel between the scene and the photo; their mean is 1.
+
+    The mean is taken of the logarithms: what all photos share is the scene's own brightness.
+    """
+
+    def __init__(self, photos: int) -> None:
+        super().__init__()
+        self.log_gain = nn.Parameter(torch.zeros(photos, 3))
+
+    def gains(self) -> Tensor:
+        """``(V, 3)`` factors."""
+        return torch.exp(self.log_gain - self.log_gain.mean(0))
+
+    def parts(self) -> list[Part]:
+        """How it is stepped."""
+        return [Part("log_gain", ("log_gain",), 1e-2, 0.1, warmup=50)]
 
 
 class Stepper:
@@ -88,6 +108,7 @@ def fit(
     batch_rays: int,
     seed: int,
     rate: float = 1.0,
+    exposure: bool = False,
     shards: int = 2,
     threads: int = 2,
     log_every: int = 50,
@@ -99,22 +120,25 @@ def fit(
     """Fit ``model`` (a :class:`Field`) in place; the course of it comes out.
 
     ``shards`` pieces of each batch run side by side on up to ``threads`` cores: the shards decide
-    the bytes, the threads do not. ``rate`` multiplies every learning rate.
+    the bytes, the threads do not. ``rate`` multiplies every learning rate. With
+    ``exposure`` each photo has a brightness of its own (``gains`` of the record, ``(V, 3)``).
     ``save(step, state)`` is called every ``save_every`` steps;
     ``resume`` takes such a pair and goes on to the same bytes. ``progress(step, loss, psnr)``.
     Raises UserError when the loss is not finite.
     """
-    steppers = _steppers(model, steps, rate)
+    light = Exposure(buffer.photos).to(buffer.device) if exposure else None
+    learned = [model] if light is None else [model, light]
+    steppers = [stepper for module in learned for stepper in _steppers(module, steps, rate)]
     record = Record()
     running: list[Tensor] = []
     first = 0
     if resume is not None:
-        first = _restore(model, steppers, record, resume)
+        first = _restore(learned, steppers, record, resume)
         running = list(resume[1]["running"])
     with _pool(threads, buffer.device) as pool:
         for step in range(first, steps):
             batch = buffer.batch(step, batch_rays)
-            losses = _one_step(model, steppers, batch, step, seed, shards, pool)
+            losses = _one_step(model, light, steppers, batch, step, seed, shards, pool)
             running.append(losses)
             done = step + 1
             if done % log_every == 0 or done == steps:
@@ -126,12 +150,15 @@ def fit(
                 if progress is not None:
                     progress(done, loss, psnr)
             if save is not None and save_every and done % save_every == 0 and done < steps:
-                save(done, _state(model, steppers, record, running))
+                save(done, _state(learned, steppers, record, running))
+    if light is not None:
+        record.gains = light.gains().detach().cpu()
     return record
 
 
 def _one_step(
     model: nn.Module,
+    light: Exposure | None,
     steppers: list[Stepper],
     batch: Batch,
     step: int,
@@ -154,8 +181,9 @@ def _one_step(
         source = torch.Generator(piece.observed.device)
         source.manual_seed((seed * 1_000_003 + step) * 64 + number)
         sink: list[RowGradient] = []
+        gain = None if light is None else light.gains()[piece.view]
         loss, photometric = _as_field(model).loss(
-            piece.rays, piece.observed, piece.drop_mask, step, source, sink
+            piece.rays, piece.observed, piece.drop_mask, step, source, sink, gain
         )
         gradients = torch.autograd.grad(
             loss * share, [parameter for _, parameter in dense], allow_unused=True
@@ -253,9 +281,9 @@ def _check_finite(loss: float, step: int) -> None:
 
 
 def _state(
-    model: nn.Module, steppers: list[Stepper], record: Record, running: list[Tensor]
+    learned: list[nn.Module], steppers: list[Stepper], record: Record, running: list[Tensor]
 ) -> dict[str, Tensor]:
-    state = {f"model:{name}": value.detach() for name, value in model.named_parameters()}
+    state = {f"model:{name}": value.detach() for name, value in _named(learned)}
     for stepper in steppers:
         state |= stepper.state()
     state["record"] = torch.tensor(record.rows, dtype=torch.float64).reshape(-1, 3)
@@ -264,15 +292,19 @@ def _state(
     return state
 
 
+def _named(learned: list[nn.Module]) -> list[tuple[str, nn.Parameter]]:
+    return [entry for module in learned for entry in module.named_parameters()]
+
+
 def _restore(
-    model: nn.Module,
+    learned: list[nn.Module],
     steppers: list[Stepper],
     record: Record,
     resume: tuple[int, dict[str, Tensor]],
 ) -> int:
     step, state = resume
     with torch.no_grad():
-        for name, parameter in model.named_parameters():
+        for name, parameter in _named(learned):
             parameter.copy_(state[f"model:{name}"])
     for stepper in steppers:
         stepper.restore(state)

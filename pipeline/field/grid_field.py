@@ -76,16 +76,18 @@ class GridField(nn.Module):
         step: int,
         generator: torch.Generator,
         sink: list[RowGradient],
+        gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :class:`pipeline.field.base.Field`."""
         learn_proposal = step < 200 or step % 4 == 0
         with torch.set_grad_enabled(learn_proposal):
             proposed = self._propose(rays, generator, sink)
         out = self._shade(rays, proposed.detach(), generator, sink)
-        photometric = masked_photometric_loss(out.rgb, observed, drop_mask)
+        rgb = out.rgb if gain is None else out.rgb * gain
+        photometric = masked_photometric_loss(rgb, observed, drop_mask)
         total = photometric
         if self.config.trim > 0.0 and step >= 200:
-            total = masked_photometric_loss(out.rgb, observed, drop_mask, self.config.trim)
+            total = masked_photometric_loss(rgb, observed, drop_mask, self.config.trim)
         if learn_proposal:
             total = total + proposal_loss(out.edges, out.weights, proposed)
         if self.config.distortion > 0.0:

@@ -90,11 +90,14 @@ class PaperField(nn.Module):
         step: int,
         generator: torch.Generator,
         sink: list[RowGradient],
+        gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The sum of both networks' photometric losses; the fine one's alone beside it."""
-        coarse, fine = self._trace(rays, generator)
-        photometric = masked_photometric_loss(fine.rgb, observed, drop_mask)
-        return photometric + masked_photometric_loss(coarse.rgb, observed, drop_mask), photometric
+        coarse, fine = (one.rgb for one in self._trace(rays, generator))
+        if gain is not None:
+            coarse, fine = coarse * gain, fine * gain
+        photometric = masked_photometric_loss(fine, observed, drop_mask)
+        return photometric + masked_photometric_loss(coarse, observed, drop_mask), photometric
 
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""

@@ -119,7 +119,8 @@ def test_a_fit_killed_at_any_step_ends_with_the_same_bytes(
     photos: list[PosedPhoto], tmp_path: Path, at: int
 ) -> None:
     """The process dies after step ``at``, a checkpoint every third step lies on disk; run again."""
-    how = {"steps": 12, "batch_rays": 256, "seed": 3, "log_every": 5, "save_every": 3}
+    how = {"steps": 12, "batch_rays": 256, "seed": 3, "log_every": 5, "save_every": 3,
+           "exposure": True}  # fmt: skip
     checkpoint = Checkpoint(tmp_path / "checkpoint.safetensors", "key")
     whole, dying, later = field(photos), field(photos), field(photos, seed=99)
     first = fit(whole, RayBuffer(photos, 0), **how)
@@ -157,6 +158,21 @@ def test_soft_masks_reach_the_loss(photos: list[PosedPhoto]) -> None:
         models.append(field(photos))
         fit(models[-1], RayBuffer(marked, 0), steps=6, batch_rays=256, seed=0)
     assert same(*models)
+
+
+def test_the_exposure_of_each_photo_is_found(photos: list[PosedPhoto]) -> None:
+    """Half of the photos half as bright: ratios between photos come out, the mean stays 1."""
+    dark = [0.5 if i % 2 else 1.0 for i in range(len(photos))]
+    lit = [
+        PosedPhoto(**{**vars(p), "image": p.image * d}) for p, d in zip(photos, dark, strict=True)
+    ]
+    record = fit(
+        field(lit), RayBuffer(lit, 0), steps=250, batch_rays=512, seed=0, exposure=True, rate=2.0
+    )
+    logs = record.gains.log()
+    assert logs.mean(0).abs().max() < 1e-5
+    steps = logs[::2].mean(0) - logs[1::2].mean(0)
+    assert torch.all((steps - np.log(2.0)).abs() < 0.15)
 
 
 def test_the_rate_scales_every_step(photos: list[PosedPhoto]) -> None:
