@@ -1,6 +1,6 @@
 """Rays per second and PSNR over time: the fast field and the paper's NeRF, on one core and two.
 
-    python -m benchmarks.field                     # about three minutes
+    python -m benchmarks.field                     # about four minutes
     python -m benchmarks.field --seconds 60 --paper-seconds 600
 
 The scene is cast here: textured boxes, 24 views, exact poses, every eighth view held out. Times are
@@ -13,10 +13,11 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "field"))
@@ -25,11 +26,12 @@ from scene import camera, photograph  # noqa: E402
 
 from pipeline.field.buffer import PosedPhoto, RayBuffer  # noqa: E402
 from pipeline.field.fit import fit  # noqa: E402
+from pipeline.field.grid_field import GridField  # noqa: E402
 from pipeline.field.model import build, grid_sizes, scene_space  # noqa: E402
+from pipeline.field.paper_field import PaperField  # noqa: E402
 from pipeline.field.render import render_view  # noqa: E402
 
 VIEWS, SIZE, FOCAL, NEAR, FAR = 24, (400, 300), 380.0, 2.2, 25.0
-INTRINSICS = (FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, 0.0)
 
 
 class OutOfTime(Exception):
@@ -49,28 +51,38 @@ class Row(NamedTuple):
     render_seconds: float
 
 
-def scene() -> tuple[list[PosedPhoto], list[PosedPhoto]]:
-    """Photos to fit, and photos held out."""
+def photos_and_field(
+    model: str,
+    settings: dict[str, Any],
+    views: int = VIEWS,
+    size: tuple[int, int] = SIZE,
+) -> tuple[list[PosedPhoto], list[PosedPhoto], GridField | PaperField]:
+    """Photos to fit, photos held out, and a fresh field with params.yaml's settings."""
+    focal = FOCAL * size[0] / SIZE[0]
+    camera_numbers = (focal, focal, size[0] / 2, size[1] / 2, 0.0)
     photos = []
-    for index in range(VIEWS):
-        pose = camera(index, VIEWS)
-        image, _ = photograph(pose, *SIZE, FOCAL)
+    for index in range(views):
+        pose = camera(index, views)
+        image, _ = photograph(pose, *size, focal)
         keep = np.ones(image.shape[:2], bool)
-        photos.append(PosedPhoto(str(index), image, keep, pose, INTRINSICS, NEAR, FAR))
-    return [p for i, p in enumerate(photos) if i % 8], photos[::8]
+        photos.append(PosedPhoto(str(index), image, keep, pose, camera_numbers, NEAR, FAR))
+    cams = np.stack([photo.cam_from_world for photo in photos])
+    numbers, sizes = np.tile(camera_numbers, (views, 1)), np.tile(size, (views, 1))
+    space = scene_space("ndc", cams, numbers, sizes, NEAR, FAR)
+    config = {}
+    if model == "fast":
+        same = ("samples", "levels", "features", "table_log2", "distortion")
+        config = {k: settings[k] for k in same} | grid_sizes(space, settings["resolution"])
+    field = build(model, config, space, settings["seed"])
+    return [p for i, p in enumerate(photos) if i % 8], photos[::8], field
 
 
 def measure(
     model_name: str, threads: int, seconds: float, steps: int, batch: int, held_out_views: int
 ) -> Row:
     """Fit for ``seconds`` of wall time on a schedule of ``steps``, then render and compare."""
-    train, test = scene()
-    cams = np.stack([p.cam_from_world for p in train + test])
-    count = len(cams)
-    space = scene_space(
-        "ndc", cams, np.tile(INTRINSICS, (count, 1)), np.tile(SIZE, (count, 1)), NEAR, FAR
-    )
-    model = build(model_name, grid_sizes(space, 512) if model_name == "fast" else {}, space, 0)
+    settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
+    train, test, model = photos_and_field(model_name, settings)
     buffer = RayBuffer(train, 0)
     buffer.batch(0, batch)  # the first epoch is shuffled before the clock starts
     begin, cpu, done = time.perf_counter(), time.process_time(), 0
@@ -91,7 +103,7 @@ def measure(
     torch.set_num_threads(threads)
     begin, errors = time.perf_counter(), []
     for photo in test[:held_out_views]:
-        view = render_view(model, photo.cam_from_world, INTRINSICS, SIZE, NEAR, FAR)
+        view = render_view(model, photo.cam_from_world, photo.intrinsics, SIZE, NEAR, FAR)
         errors.append(-10 * np.log10(float(((view.rgb - photo.image) ** 2).mean())))
     each = (time.perf_counter() - begin) / max(1, len(errors))
     psnr = float(np.mean(errors)) if errors else float("nan")
@@ -101,18 +113,29 @@ def measure(
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, nargs="+", default=[10.0, 30.0])
+    parser.add_argument("--seconds", type=float, nargs="+", default=[5.0, 10.0, 20.0, 40.0])
     parser.add_argument("--paper-seconds", type=float, default=30.0)
-    parser.add_argument("--steps-per-second", type=float, default=15.0, help="for the schedule")
+    parser.add_argument("--paper-views", type=int, default=0, help="held-out views it renders")
+    parser.add_argument("--steps-per-second", type=float, default=11.0, help="of one thread")
     flags = parser.parse_args()
     print(f"{'model':6} {'threads':>7} {'steps':>6} {'fit s':>7} {'cpu ms/step':>11} "
           f"{'rays/s':>9} {'PSNR dB':>8} {'s/view':>7}")  # fmt: skip
     jobs = [
-        ("fast", threads, seconds, max(50, int(seconds * flags.steps_per_second)), 4096, 3)
+        (
+            "fast",
+            threads,
+            seconds,
+            max(50, int(seconds * flags.steps_per_second * (1 if threads == 1 else 1.7))),
+            4096,
+            3,
+        )
         for seconds in flags.seconds
         for threads in (1, 2)
     ]
-    jobs += [("paper", threads, flags.paper_seconds, 200_000, 1024, 0) for threads in (1, 2)]
+    jobs += [
+        ("paper", threads, flags.paper_seconds, 200_000, 1024, flags.paper_views)
+        for threads in (1, 2)
+    ]
     for job in jobs:
         row = measure(*job)
         psnr = f"{row.psnr:8.2f}" if np.isfinite(row.psnr) else "       -"

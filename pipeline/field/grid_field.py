@@ -79,7 +79,7 @@ class GridField(nn.Module):
         gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :class:`pipeline.field.base.Field`."""
-        learn_proposal = step < 200 or step % 4 == 0
+        learn_proposal = step < 200 or step % 2 == 0
         with torch.set_grad_enabled(learn_proposal):
             proposed = self._propose(rays, generator, sink)
         out = self._shade(rays, proposed.detach(), generator, sink)
@@ -98,7 +98,7 @@ class GridField(nn.Module):
         """See :class:`pipeline.field.base.Field`."""
         betas = (0.9, 0.99)
         tables = [
-            Part(f"grid.tables.{i}", (f"grid.tables.{i}",), 2e-2, 0.03, betas, 1e-15, 50)
+            Part(f"grid.tables.{i}", (f"grid.tables.{i}",), 4e-2, 0.03, betas, 1e-15, 50)
             for i in range(len(self.grid.tables))
         ]
         head = tuple(

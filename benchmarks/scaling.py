@@ -1,0 +1,155 @@
+"""Where an iteration's time goes, and what images and resolution cost in time and memory.
+
+    python -m benchmarks.scaling            # about two minutes
+
+Stages: each part of a step of the fast field timed by itself on one thread, beside the floor that
+the machine sets for it: floating-point operations over the rate of a large matrix product measured
+here, or bytes moved over the bandwidth of a large copy measured here, whichever takes longer.
+Random reads of table rows count with whole cache lines.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from benchmarks.field import FAR, NEAR, photos_and_field
+from pipeline.field.buffer import RayBuffer
+from pipeline.field.encoding import add_rows, cell_corners, gather
+from pipeline.field.fit import fit
+from pipeline.field.render import render_view
+
+ROOT = Path(__file__).resolve().parents[1]
+LINE = 64
+
+
+def best(work: Callable[[], Any], repeats: int = 7) -> float:
+    """Seconds of the fastest of a few runs."""
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def machine() -> tuple[float, float]:
+    """Measured floating-point operations and bytes per second of one thread."""
+    a = torch.randn(32768, 64)
+    b = torch.randn(64, 64)
+    flops = 2 * a.shape[0] * 64 * 64 / best(lambda: a @ b)
+    big = torch.zeros(16_000_000)
+    target = torch.empty_like(big)
+    bandwidth = 2 * big.numel() * 4 / best(lambda: target.copy_(big))
+    return flops, bandwidth
+
+
+def stages(settings: dict[str, Any]) -> None:
+    """Milliseconds of each part of one step, beside its floor."""
+    flops, bandwidth = machine()
+    print(
+        f"one thread: {flops / 1e9:.0f} GFLOP/s (32768x64 by 64x64), {bandwidth / 1e9:.1f} GB/s (copy)"
+    )
+    train, _, model = photos_and_field("fast", settings)
+    buffer = RayBuffer(train, 0)
+    rays_per_step, samples = settings["batch_rays"], model.config.samples
+    count, levels = rays_per_step * samples, model.config.levels
+    rays = buffer.batch(0, rays_per_step).rays
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(3, count, generator=generator)
+    grid, hidden = model.grid, model.config.hidden
+    corners = [cell_corners(x, r, s) for r, s in zip(grid.resolutions, grid.sizes, strict=True)]
+    features = torch.randn(count, levels * model.config.features)
+    gradient = torch.randn(count, model.config.features)
+    row_bytes = max(LINE, 4 * model.config.features)
+
+    def head() -> None:
+        shape = model.shape_out(torch.relu(model.shape_in(leaf)))
+        torch.autograd.grad(shape.sum(), [leaf, *model.shape_in.parameters()])
+
+    leaf = features.requires_grad_()
+    table = sum(t.numel() for t in grid.tables)
+    adam = torch.optim.Adam(grid.parameters(), lr=1e-3, fused=True)
+    for parameter in grid.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+
+    def read() -> None:
+        for (rows, weights), t in zip(corners, grid.tables, strict=True):
+            gather(t.detach(), rows, weights)
+
+    def add() -> None:
+        for (rows, weights), size in zip(corners, grid.sizes, strict=True):
+            add_rows(rows, weights, gradient, size)
+
+    def place() -> None:
+        for r, s in zip(grid.resolutions, grid.sizes, strict=True):
+            cell_corners(x, r, s)
+
+    bins = model.config.bins
+    lookups = count * 8 * levels
+    work = [
+        ("batch of rays", lambda: buffer.batch(1, rays_per_step), 0, rays_per_step * 60),
+        ("proposal, forward", lambda: model._propose(rays, generator, []), 0,
+         rays_per_step * bins * (LINE + 40)),
+        ("corners and weights", place, 0, lookups * 8),
+        ("read rows", read, 0, lookups * (row_bytes + 8)),
+        ("add rows", add, 0, lookups * (2 * row_bytes + 8)),
+        ("shape network, both ways", head,
+         3 * 2 * count * hidden * (levels * model.config.features + 16), 0),
+        ("Adam, tables", lambda: adam.step(), 0, table * 4 * 7),
+    ]  # fmt: skip
+    print(f"{'stage':26} {'ms':>7} {'floor ms':>9} {'times':>6}")
+    for name, run, operations, moved in work:
+        taken = best(run)
+        floor = max(operations / flops, moved / bandwidth)
+        print(f"{name:26} {1e3 * taken:7.2f} {1e3 * floor:9.2f} {taken / floor:6.1f}")
+
+
+def cost(settings: dict[str, Any], views: int, width: int) -> None:
+    """One row: milliseconds per step, seconds per view and peak memory of this process."""
+    height = width * 3 // 4
+    train, test, model = photos_and_field("fast", settings, views, (width, height))
+    buffer = RayBuffer(train, 0)
+    fit(model, buffer, steps=5, batch_rays=settings["batch_rays"], seed=0, threads=1)
+    begin = time.perf_counter()
+    fit(model, buffer, steps=30, batch_rays=settings["batch_rays"], seed=0, threads=1)
+    step = (time.perf_counter() - begin) / 30
+    photo, begin = test[0], time.perf_counter()
+    size = (width, height)
+    render_view(model, photo.cam_from_world, photo.intrinsics, size, NEAR, FAR)
+    view = time.perf_counter() - begin
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{views:6d} {width:5d}x{height:<5d} {1e3 * step:8.1f} {view:7.2f} {peak:8.0f}", flush=True
+    )
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--row", type=int, nargs=2, metavar=("VIEWS", "WIDTH"), help="one row only")
+    flags = parser.parse_args()
+    settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
+    torch.set_num_threads(1)
+    if flags.row:
+        cost(settings, *flags.row)
+        return
+    stages(settings)
+    print(f"\n{'images':>6} {'size':11} {'ms/step':>8} {'s/view':>7} {'peak MB':>8}")
+    for views, width in ((12, 400), (24, 400), (48, 400), (24, 200), (24, 800)):
+        # A process of its own for every row: peak memory never falls within one.
+        command = [sys.executable, "-m", "benchmarks.scaling", "--row", str(views), str(width)]
+        subprocess.run(command, check=True, cwd=ROOT)
+
+
+if __name__ == "__main__":
+    main()
