@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pipeline.errors import UserError
 
@@ -86,6 +89,13 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 `text` to `path`, whole or not at all."""
     write_bytes(path, text.encode())
+
+
+def write_npy(path: Path, values: np.ndarray) -> None:
+    """Writes an array as .npy; same values, same bytes."""
+    file = io.BytesIO()
+    np.save(file, values, allow_pickle=False)
+    write_bytes(path, file.getvalue())
 
 
 def write_json(path: Path, content: Any) -> None:

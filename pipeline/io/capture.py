@@ -10,8 +10,9 @@ from pathlib import Path
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir
-from pipeline.io.given import GivenView, read_nerfstudio, read_poses_bounds
+from pipeline.io.given import GivenView, read_nerfstudio
 from pipeline.io.images import PHOTO_SUFFIXES
+from pipeline.io.llff import read_poses_bounds
 from pipeline.io.photos import VIDEO_SUFFIXES, by_image_name, image_name, list_photos
 
 TRANSFORMS = "transforms.json"

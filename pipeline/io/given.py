@@ -1,12 +1,11 @@
-"""Poses and masks that come with photos: nerfstudio's transforms.json, LLFF's poses_bounds.npy.
+"""Cameras that come with photos, whoever found them, and nerfstudio's transforms.json.
 
-COLMAP models are read where pycolmap is (`pipeline.sfm`); what they say ends up here as well.
+LLFF's poses_bounds.npy is read in `pipeline.io.llff`, COLMAP models where pycolmap is (`pipeline.sfm`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -80,6 +79,14 @@ class GivenView:
             near=self.near,
             far=self.far,
         )
+
+
+def of_view(view: View) -> GivenView:
+    """The same camera as one that came with photos."""
+    return GivenView(
+        Path(view.name), view.cam_from_world, view.width, view.height,
+        view.fx, view.fy, view.cx, view.cy, (view.k1, 0.0, 0.0, 0.0), near=view.near, far=view.far,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -206,50 +213,3 @@ def _existing(path: Path, relative: str) -> Path:
     raise UserError(
         f"{path} names {relative}, which does not exist.", "Keep the file beside its photos."
     )
-
-
-def read_poses_bounds(path: Path, photos: Sequence[Path]) -> list[GivenView]:
-    """The cameras of LLFF's poses_bounds.npy for `photos`, which are its rows in name order.
-
-    Each row is a (3, 5) matrix, world-from-camera with the axes down, right, back, then (H, W, f),
-    and the near and far depth. The principal point is the centre. UserError for a damaged file or
-    another number of photos.
-    """
-    rows = read_npy(path)
-    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
-        raise UserError(f"{path} has shape {rows.shape}; N rows of 17 numbers are expected.")
-    if len(rows) != len(photos):
-        raise UserError(
-            f"{path} holds {len(rows)} poses, but there are {len(photos)} photos.",
-            "LLFF pairs them by name order; every photo needs its row.",
-        )
-    views = []
-    for photo, row in zip(sorted(photos), rows.astype(np.float64), strict=True):
-        matrix = row[:15].reshape(3, 5)
-        down, right, back, place, (height, width, focal) = matrix.T
-        world_from_cam = np.eye(4)
-        world_from_cam[:3] = np.stack([right, down, -back, place], axis=1)
-        checked_rigid(world_from_cam, f"{path}: the pose of {photo.name}")
-        views.append(
-            GivenView(
-                photo=photo,
-                cam_from_world=np.linalg.inv(world_from_cam),
-                width=round(width),
-                height=round(height),
-                fx=focal,
-                fy=focal,
-                cx=width / 2,
-                cy=height / 2,
-                near=float(row[15]),
-                far=float(row[16]),
-            )
-        )
-    return views
-
-
-def read_npy(path: Path) -> np.ndarray:
-    """The array in a .npy file; UserError when it is damaged or holds Python objects."""
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} is not a readable array ({error}).") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import warnings
 from dataclasses import dataclass
@@ -162,3 +163,14 @@ def shrink(pixels: np.ndarray, longest_side: int) -> np.ndarray:
     if factor >= 1.0:
         return pixels
     return resized(pixels, (max(1, round(width * factor)), max(1, round(height * factor))))
+
+
+def write_photo(path: Path, rgb: np.ndarray, focal_px: float) -> None:
+    """Writes an (H, W, 3) float RGB image as a JPEG that tells its focal length, as a camera's does."""
+    pixels = np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8)
+    exif = Image.Exif()
+    equivalent = focal_px / math.hypot(*pixels.shape[:2]) * _DIAGONAL_35MM
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = max(1, round(equivalent))
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=95, subsampling=0, exif=exif)
+    write_bytes(path, file.getvalue())

@@ -63,21 +63,24 @@ _NUMBERS = {
 
 
 def write_transforms(
-    path: Path, views: Iterable[View], extras: Mapping[str, Any] | None = None
+    path: Path,
+    views: Iterable[View],
+    extras: Mapping[str, Any] | None = None,
+    beside: str = "../",
 ) -> None:
     """Writes transforms.json with intrinsics, image and mask path per frame.
 
-    Paths are relative to the file's folder, which lies beside `images/` and `masks/`.
+    `beside` leads from the file's folder to the one that holds `images/` and `masks/`.
     """
-    frames = [_frame(view) for view in sorted(views, key=lambda view: view.name)]
+    frames = [_frame(view, beside) for view in sorted(views, key=lambda view: view.name)]
     write_json(path, {"camera_model": "OPENCV", **(extras or {}), "frames": frames})
 
 
-def _frame(view: View) -> dict[str, Any]:
+def _frame(view: View, beside: str) -> dict[str, Any]:
     numbers = {key: round(float(getattr(view, field)), 10) for key, field in _NUMBERS.items()}
     return numbers | {
-        "file_path": f"../images/{view.name}",
-        "mask_path": f"../masks/{view.name}",
+        "file_path": f"{beside}images/{view.name}",
+        "mask_path": f"{beside}masks/{view.name}",
         "w": view.width,
         "h": view.height,
         "k2": 0.0,

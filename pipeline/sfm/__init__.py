@@ -7,6 +7,7 @@ writes abort the process; hence the import below, which must stay first.
 import zlib  # noqa: F401
 
 from pipeline.sfm.database import Progress
+from pipeline.sfm.export import read_sparse, sparse_points, write_straight
 from pipeline.sfm.given import read_colmap, triangulate
 from pipeline.sfm.model import write_sparse
 from pipeline.sfm.reconstruct import reconstruct
@@ -20,7 +21,10 @@ __all__ = [
     "Settings",
     "account",
     "read_colmap",
+    "read_sparse",
     "reconstruct",
+    "sparse_points",
     "triangulate",
     "write_sparse",
+    "write_straight",
 ]

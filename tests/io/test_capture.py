@@ -17,9 +17,9 @@ from pipeline.io.given import (
     GivenView,
     Straightener,
     read_nerfstudio,
-    read_poses_bounds,
     straightened,
 )
+from pipeline.io.llff import read_poses_bounds
 from pipeline.io.masks import fit_mask, rain_mask, read_foreign_mask, read_rain_mask
 
 NAMES = ("a.jpg", "b.jpg", "c.jpg")
