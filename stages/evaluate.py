@@ -12,6 +12,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation import flip, lpips
 from pipeline.evaluation.poses import pose_numbers, read_true_cameras
 from pipeline.evaluation.references import find_references
+from pipeline.evaluation.rounds import score_rounds
 from pipeline.evaluation.score import Files, score_image
 from pipeline.evaluation.summary import as_csv, headline, summarise
 from pipeline.io.atomic import write_json, write_text
@@ -53,6 +54,7 @@ def main(job: Job, params: Params) -> str:
         len(records),
         f"{_shown(job, truth)} does not exist",
     )
+    metrics["rounds"] = score_rounds(paths.refine, files, params.coverage_threshold)
     metrics["conventions"] = {
         "data_range": 1.0,
         "flip": f"LDR, {flip.PIXELS_PER_DEGREE} pixels per degree, mean over pixels and images",
@@ -81,7 +83,7 @@ def _files(job: Job, records: Sequence[ImageRecord]) -> dict[str, Files]:
             record=record,
             source=paths.data / record.source,
             photo=paths.images / record.name,
-            keep_mask=paths.masks / record.name,
+            keep_mask=paths.refine / record.name,
             test=view("test", record.name),
             fitted=view("input", record.name) or view("test", record.name),
             composite=view("composite", record.name),

@@ -55,7 +55,7 @@ def main(job: Job, params: Params) -> str:
         raise UserError("No photo has a pose.", "See poses/poses.json for why.")
     near = min(view.near for view in views.values())
     far = max(view.far for view in views.values()) * params.far_factor
-    masks = job.paths.masks if params.use_masks else None
+    masks = job.paths.refine if params.use_masks else None
     photos = photos_to_fit(read_posed_images(job.paths.images, masks, views), near, far)
     settings = params.model_dump(include=SETTINGS)
     field = build_around(params.model, list(views.values()), near, far, **settings).to(job.device)

@@ -50,12 +50,12 @@ def main(job: Job, params: Params) -> str:
         for folder in ("test", "input", "composite", "depth", "seen"):
             (fresh / folder).mkdir()
         fill = (params.feather_px, params.gain_px)
-        where = (paths.nerf, paths.images, paths.masks, fresh)
+        where = (paths.nerf, paths.images, paths.refine, fresh)
         tasks = {r.name: (views[r.name], r.split, fill, job.device, *where) for r in records}
         map_named(_one_view, tasks, job_label="render", **how)
         if params.seen_counts:
             train = tuple(views[r.name] for r in records if r.split == "train")
-            items = {r.name: (views[r.name], train, paths.masks, fresh) for r in records}
+            items = {r.name: (views[r.name], train, paths.refine, fresh) for r in records}
             write_json(fresh / "seen.json", map_named(_count_seen, items, job_label="seen", **how))
         if params.path_frames > 1 and len(views) > 1:
             _film(job, params, list(views.values()), fresh, how)

@@ -70,7 +70,10 @@ def main(job: Job, params: Params) -> str:
         charts=charts(paths, other_paths if compared else None, records),
         coverage=heat,
         coverage_max=heat_max,
-        masks_note=notes.masks_note(gather.optional_json(paths.masks / "masks.json")),
+        masks_note=notes.masks_note(gather.optional_json(paths.masks / "masks.json"))
+        + notes.rounds_note(
+            gather.optional_json(paths.refine / "refine.json"), metrics.get("rounds", {})
+        ),
         poses_note=notes.poses_note(account, len(records)),
         lost=lost,
         video=film,

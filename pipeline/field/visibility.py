@@ -51,6 +51,15 @@ def shares(count: np.ndarray) -> dict[str, float]:
     }
 
 
+def seen_by_others(index: int, witnesses: Sequence[Witness], fewest: int) -> np.ndarray:
+    """Which pixels ``(H, W)`` of one witness show a surface that ``fewest`` others saw uncovered."""
+    own = witnesses[index]
+    others = [witness for number, witness in enumerate(witnesses) if number != index]
+    seen = witness_count(own, others, stride=2) >= fewest
+    height, width = own.depth.shape
+    return np.repeat(np.repeat(seen, 2, axis=0), 2, axis=1)[:height, :width]
+
+
 def _sees(other: Witness, points: np.ndarray) -> np.ndarray:
     fx, fy, cx, cy, k1 = other.intrinsics
     x, y, z = other.cam_from_world[:3, :3] @ points + other.cam_from_world[:3, 3:]

@@ -32,11 +32,14 @@ def read_keep_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarra
     `size` is the image's (width, height). UserError when the file is missing or unreadable, has more
     than one channel, holds values other than 0 and 255, or is not of that size.
     """
+    maker = "refine" if path.parent.name == "refine" else "masks"
     if not path.is_file():
-        raise UserError(f"{path} does not exist.", "Run `python -m stages.masks` first.")
+        raise UserError(f"{path} does not exist.", f"Run `python -m stages.{maker}` first.")
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if values is None:
-        raise UserError(f"{path} is not a readable image.", "Run `python -m stages.masks` again.")
+        raise UserError(
+            f"{path} is not a readable image.", f"Run `python -m stages.{maker}` again."
+        )
     if values.ndim != 2:
         raise UserError(
             f"{path} has {values.shape[2]} channels; a mask has one.", "Save it as 8-bit grey."
@@ -101,3 +104,15 @@ def fit_mask(keep_mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         return keep_mask
     share = cv2.resize(keep_mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return share >= 0.5
+
+
+def write_drop_masks(folder: Path, names: Sequence[str], drop_masks: Sequence[np.ndarray]) -> None:
+    """Writes (H, W) drop masks (True = drop) into `folder` as keep masks under their images' names."""
+    for name, drop_mask in zip(names, drop_masks, strict=True):
+        write_keep_mask(folder / name, ~drop_mask)
+
+
+def copy_keep_masks(source: Path, target: Path) -> None:
+    """Copies all keep masks of a folder; UserError when one is damaged."""
+    for path in sorted(source.glob("*.png")):
+        write_keep_mask(target / path.name, read_keep_mask(path))

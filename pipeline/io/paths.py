@@ -61,6 +61,11 @@ class ScenePaths:
         return self.artifacts / "poses"
 
     @property
+    def refine(self) -> Path:
+        """Masks repaired from the scene, the ones that the fit uses; a variant may have its own."""
+        return self.artifacts / "refine"
+
+    @property
     def out(self) -> Path:
         """The scene's own folder, or its variant's."""
         return self.artifacts / self.variant if self.variant else self.artifacts

@@ -19,7 +19,7 @@ from pipeline.geometry.poses import invert
 from pipeline.geometry.rays import pixel_rays
 from pipeline.geometry.spaces import mean_camera
 
-MAX_CELLS = 2_000_000
+MAX_CELLS = 1_000_000
 
 
 class GlassCamera(NamedTuple):
@@ -171,7 +171,7 @@ def pane_depths(pane_from_world: np.ndarray, camera: GlassCamera) -> tuple[float
     return (float(depth.min()), float(depth.max())) if depth.size else (math.inf, math.inf)
 
 
-def window(count: int, middle: int, width: int) -> range:
+def neighbours(count: int, middle: int, width: int) -> range:
     """The `width` neighbours in order of view `middle` among `count` views; 0: all of them."""
     if width <= 0 or width >= count:
         return range(count)
@@ -187,9 +187,10 @@ def gather(
     `maps[view]` (H, W) may hold NaN for pixels without a vote; None for a view without a map. Out come
     float32 values, NaN where nobody votes, and the number of votes per cell, int32.
     """
-    stack = np.stack(
-        [glass.from_view(view, values) for view in views if (values := maps[view]) is not None]
-    )
+    seen = [glass.from_view(view, values) for view in views if (values := maps[view]) is not None]
+    if not seen:
+        return np.full(glass.shape, np.nan, np.float32), np.zeros(glass.shape, np.int32)
+    stack = np.stack(seen)
     votes = np.isfinite(stack).sum(axis=0).astype(np.int32)
     if quantile is not None:
         return quantile_over_views(stack, quantile), votes

@@ -12,13 +12,17 @@ from pipeline.masking.masks import otsu
 
 FLOOR = 1e-3  # residuals below it are equal: 8-bit photos hold no less
 LARGEST_HOLE = 0.25  # of the drop around it
+SUREST = 0.02  # attention is never taken for more certain than this
+ATTENTION_WEIGHT = 0.3  # of its log-odds against the log of the residual
+JOIN = 0.4  # between the clear median (0) and Otsu's threshold (1)
 
 
 class Redrawn(NamedTuple):
     """A drop mask on the glass and what it rests on.
 
-    `drop_mask` bool; `known`: cells with votes enough to decide; `level`: the residual at which drops
-    begin; `contrast`: median residual inside the drops over that outside; NaN without either.
+    `drop_mask` bool; `known`: cells with votes enough to decide; `level`: how many times its
+    surroundings' the residual must be where a drop begins, without other evidence; `contrast`: median
+    residual inside the drops over that outside; NaN without either.
     """
 
     drop_mask: np.ndarray
@@ -28,23 +32,63 @@ class Redrawn(NamedTuple):
 
 
 def redraw(
-    gathered: np.ndarray, votes: np.ndarray, previous: np.ndarray, fewest_votes: int
+    gathered: np.ndarray,
+    votes: np.ndarray,
+    previous: np.ndarray,
+    fewest_votes: int,
+    *,
+    reach: float,
+    attention: np.ndarray | None = None,
 ) -> Redrawn:
     """The drop mask on the glass from the gathered residual; `previous` where too few views voted.
 
-    Otsu's threshold on the logarithm, opening 3x3, holes filled: water has no holes.
+    What counts is the logarithm of the residual over that of the clear surroundings within `reach`
+    cells: a field is worse in foliage than on a road, and drops are smaller than either. The log-odds
+    of the gathered `attention`, where there is one, add to it with a small weight. Otsu's threshold
+    tells what surely is a drop; half-way down to the clear median its surroundings join it. Then an
+    opening 3x3, and holes are filled: water has none.
     """
     known = np.isfinite(gathered) & (votes >= fewest_votes)
-    if not known.any():
+    if known.sum() < 2:
         return Redrawn(previous.copy(), known, float("nan"), float("nan"))
-    logs = np.log(np.maximum(np.where(known, gathered, 1.0), FLOOR))
-    level = otsu(logs[known])
-    drop_mask = without_holes(opened(known & (logs > level)))
+    logs = np.log(np.maximum(np.where(known, gathered, 1.0), FLOOR)).astype(np.float32)
+    above = _above_surroundings(logs, known, reach)
+    score = above
+    if attention is not None:
+        odds = np.clip(np.nan_to_num(attention, nan=0.5), SUREST, 1 - SUREST)
+        odds = np.log(odds / (1 - odds))
+        score = above + ATTENTION_WEIGHT * (odds - np.median(odds[known]))
+    sure = otsu(score[known])
+    middle = float(np.median(score[known & (score <= sure)]))
+    begin = middle + JOIN * (sure - middle)
+    drop_mask = without_holes(joined(known & (score > begin), known & (score > sure)))
     inside, outside = gathered[known & drop_mask], gathered[known & ~drop_mask]
     contrast = float("nan")
     if inside.size and outside.size:
         contrast = float(np.median(inside) / max(float(np.median(outside)), FLOOR))
-    return Redrawn(np.where(known, drop_mask, previous), known, float(np.exp(level)), contrast)
+    level = float(np.exp(begin - middle))
+    return Redrawn(np.where(known, drop_mask, previous), known, level, contrast)
+
+
+def _above_surroundings(logs: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
+    """`logs` minus their mean over the clear cells around; what is clear is found on the way."""
+    clear = known & (logs <= otsu(logs[known]))
+    above = logs
+    for _ in range(4):
+        share = cv2.GaussianBlur(clear.astype(np.float32), (0, 0), reach)
+        around = cv2.GaussianBlur(np.where(clear, logs, np.float32(0)), (0, 0), reach)
+        everywhere = float(logs[clear].mean())
+        # Where nothing near is clear, what is clear everywhere has to do.
+        above = logs - (around + 1e-3 * everywhere) / (share + 1e-3)
+        clear = known & (above <= otsu(above[known]))
+    return above
+
+
+def joined(wide: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The regions of `wide`, opened by 3x3, that hold a pixel of `seeds` (hysteresis)."""
+    regions, _ = ndimage.label(opened(wide), np.ones((3, 3)))
+    found = np.unique(regions[seeds & (regions > 0)])
+    return np.isin(regions, found[found > 0])
 
 
 def opened(drop_mask: np.ndarray) -> np.ndarray:

@@ -6,23 +6,23 @@ import cv2
 import numpy as np
 
 MOST = 0.3  # a larger difference says nothing more
-BLUR_PX = 1.0
+BLUR_PX = 0.8
 DARK = 0.02  # pixels darker than this say nothing about the exposure
 
 
 def residual(
     render: np.ndarray, photo: np.ndarray, keep_mask: np.ndarray, sure: np.ndarray
 ) -> np.ndarray:
-    """|render - photo|, mean over RGB, (H, W) float32 in [0, 0.3], lightly blurred.
+    """|render - photo|, mean over RGB, (H, W) float32 in [0, 0.3]; the difference is blurred first.
 
-    `render` and `photo` (H, W, 3) in [0, 1]. The photo's exposure is matched first, one gain per
-    channel: the median ratio over the pixels of `keep_mask`. NaN where not `sure`: where the field has
-    no reason to know the scene, its disagreement tells nothing about the glass.
+    `render` and `photo` (H, W, 3) in [0, 1]. Blurring before the absolute value cancels the grain of a
+    field that was fitted briefly; water moves the picture by more than that. The photo's exposure is
+    matched before, one gain per channel: the median ratio over the pixels of `keep_mask`. NaN where not
+    `sure`: where the field has no reason to know the scene, its disagreement tells nothing.
     """
-    difference = np.abs(render * exposure(render, photo, keep_mask) - photo).mean(axis=2)
-    weight = cv2.GaussianBlur(sure.astype(np.float32), (0, 0), BLUR_PX)
-    values = np.where(sure, np.minimum(difference, MOST), 0.0).astype(np.float32)
-    values = cv2.GaussianBlur(values, (0, 0), BLUR_PX) / np.maximum(weight, 1e-6)
+    difference = render * exposure(render, photo, keep_mask) - photo
+    smooth = cv2.GaussianBlur(difference.astype(np.float32), (0, 0), BLUR_PX)
+    values = np.minimum(np.abs(smooth).mean(axis=2), MOST)
     return np.where(sure, values, np.nan).astype(np.float32)
 
 

@@ -42,8 +42,8 @@ def photo_pictures(
     attention = paths.attention / f"{record.stem}.exr"
     if attention.is_file():
         found["attention"] = attention_heat(photo, read_map(attention))
-    if (paths.masks / record.name).is_file():
-        keep_mask = read_keep_mask(paths.masks / record.name, record.size)
+    if (paths.refine / record.name).is_file():
+        keep_mask = read_keep_mask(paths.refine / record.name, record.size)
         found["mask"] = mask_overlay(photo, keep_mask)
     for kind, folders in (("clean", ("input", "test")), ("composite", ("composite",))):
         for folder in folders:
@@ -69,9 +69,9 @@ def coverage_heat(
     sizes = [record.size for record in records]
     common = max(sorted(set(sizes)), key=sizes.count) if sizes else (0, 0)
     masks = [
-        ~read_keep_mask(paths.masks / record.name, record.size)
+        ~read_keep_mask(paths.refine / record.name, record.size)
         for record in records
-        if record.size == common and (paths.masks / record.name).is_file()
+        if record.size == common and (paths.refine / record.name).is_file()
     ]
     if not masks:
         return "", 0.0

@@ -33,6 +33,23 @@ def masks_note(about: Mapping[str, Any]) -> str:
     return f"{mode}: {about.get('why', 'for no given reason')}. Threshold {about.get('threshold')}."
 
 
+def rounds_note(about: Mapping[str, Any], scores: Mapping[str, Mapping[str, float]]) -> str:
+    """What the loop did to the masks, from refine.json and the rounds of metrics.json; "" without it."""
+    if not about:
+        return ""
+    rounds = []
+    for number, told in sorted(about.get("rounds", {}).items(), key=lambda item: int(item[0])):
+        text = f"round {number}: {told['coverage']:.1%} dropped"
+        score = scores.get(number, {})
+        if "iou" in score:
+            text += f", IoU {score['iou']:.3f}"
+        if "test_psnr" in score:
+            text += f", a brief fit on them {score['test_psnr']:.1f} dB"
+        rounds.append(text)
+    course = f" {'; '.join(rounds)}." if rounds else ""
+    return f" Repaired from the scene: {about.get('why', 'for no given reason')}.{course}"
+
+
 def poses_note(account: Mapping[str, Any], total: int) -> str:
     """How many photos were placed and how well, from poses.json."""
     if not account:

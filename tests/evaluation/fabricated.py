@@ -79,7 +79,7 @@ def fabricate(
     coverage = drop_coverage(width, height)
     names = [f"{prefix}_{index:02d}.png" for index in range(count)]
     records, views = [], []
-    for folder in (paths.images, paths.masks, paths.attention, paths.truth / "clean"):
+    for folder in (paths.images, paths.refine, paths.masks, paths.attention, paths.truth / "clean"):
         folder.mkdir(parents=True)
     (paths.truth / "coverage").mkdir()
     for index, name in enumerate(names):
@@ -88,7 +88,7 @@ def fabricate(
         photo = clean + coverage[..., None] * (blurred - clean)
         write_image(paths.images / name, photo)
         write_image(paths.data / name, photo)
-        write_keep_mask(paths.masks / name, coverage <= 0.3)
+        write_keep_mask(paths.refine / name, coverage <= 0.3)
         write_map(paths.attention / f"{stem}.exr", np.clip(coverage * 1.2 - 0.1, 0, 1))
         write_image(paths.truth / "clean" / name, clean)
         write_image(paths.truth / "coverage" / name, np.repeat(coverage[..., None], 3, axis=2))

@@ -88,7 +88,7 @@ def test_covered_and_kept_pixels_are_judged_apart(tmp_path):
     paths = fabricate(tmp_path)
     before, _ = evaluate(tmp_path)
     name = "view_00.png"
-    keep = read_image(paths.masks / name, "masks")[..., 0] > 0.5
+    keep = read_image(paths.refine / name, "masks")[..., 0] > 0.5
     view = read_image(paths.views / "test" / name)
     write_image(paths.views / "test" / name, np.where(keep[..., None], view, 0))
     after, _ = evaluate(tmp_path)
@@ -123,7 +123,7 @@ def test_missing_and_damaged_input_is_told(tmp_path):
     (paths.truth / "clean" / "view_03.png").unlink()
     with pytest.raises(UserError, match=r"no reference for view_03\.png"):
         evaluate(tmp_path)
-    (paths.masks / "view_04.png").unlink()
+    (paths.refine / "view_04.png").unlink()
     (paths.truth / "clean").rename(paths.truth / "elsewhere")
     with pytest.raises(UserError, match=r"view_04\.png does not exist"):
         evaluate(tmp_path)

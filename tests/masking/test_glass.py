@@ -10,10 +10,10 @@ from pipeline.masking.glass import (
     LensGlass,
     PaneGlass,
     gather,
+    neighbours,
     pane_before,
     pane_depths,
     quantile_over_views,
-    window,
 )
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -96,8 +96,8 @@ def test_quantiles_by_hand() -> None:
 
 
 def test_windows_hold_neighbours_and_stay_inside() -> None:
-    assert window(10, 4, 0) == range(10)
-    assert window(10, 4, 3) == range(3, 6)
-    assert window(10, 0, 3) == range(3)
-    assert window(10, 9, 3) == range(7, 10)
-    assert window(5, 2, 9) == range(5)
+    assert neighbours(10, 4, 0) == range(10)
+    assert neighbours(10, 4, 3) == range(3, 6)
+    assert neighbours(10, 0, 3) == range(3)
+    assert neighbours(10, 9, 3) == range(7, 10)
+    assert neighbours(5, 2, 9) == range(5)

@@ -56,19 +56,19 @@ def test_a_drop_is_where_the_residual_is_large_and_old_masks_stay_where_nobody_v
     gathered[:, 35:] = np.nan
     previous = np.zeros((30, 40), bool)
     previous[20:25, 28:38] = True
-    found = redraw(gathered, votes, previous, 2)
+    found = redraw(gathered, votes, previous, 2, reach=8)
     expected = np.zeros((30, 40), bool)
     expected[5:15, 5:15] = True
     expected[20:25, 30:38] = True
     assert np.array_equal(found.drop_mask, expected)
     assert found.known.mean() == pytest.approx(0.75)
     assert found.contrast == pytest.approx(10.0, rel=1e-3)
-    assert 0.01 < found.level < 0.1
+    assert 1 < found.level < 10
 
 
 def test_without_any_votes_the_old_mask_stays() -> None:
     previous = np.eye(5, dtype=bool)
-    found = redraw(np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1)
+    found = redraw(np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1, reach=2)
     assert np.array_equal(found.drop_mask, previous)
     assert math.isnan(found.contrast)
 

@@ -1,0 +1,17 @@
+from __future__ import annotations
+
+from pipeline.report.notes import rounds_note
+
+
+def test_the_rounds_are_told_in_their_order_with_what_is_known() -> None:
+    about = {
+        "why": "on the lens; the masks have settled",
+        "rounds": {"10": {"coverage": 0.25}, "9": {"coverage": 0.5}},
+    }
+    note = rounds_note(about, {"9": {"iou": 0.5, "test_psnr": 20.04}})
+    assert "on the lens; the masks have settled." in note
+    assert (
+        "round 9: 50.0% dropped, IoU 0.500, a brief fit on them 20.0 dB; round 10: 25.0% dropped."
+        in note
+    )
+    assert rounds_note({}, {}) == ""
