@@ -1,0 +1,83 @@
+"""How the loop fares, round by round, on scenes whose truth is known.
+
+    python -m experiments.loop --params params.yaml demo        # after `python -m stages.refine`
+    python -m experiments.loop --run --params params.yaml demo  # runs the stage first
+
+One line per scene and round: the glass, the share of pixels dropped, precision, recall and IoU against the
+true coverage (> 0.05), and the PSNR of held-out views of the brief fit on the round's masks. `masks` is what
+the detector drew. For a scene without drops every dropped pixel is a false alarm: the share is what counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.evaluation.masks import mask_counts, mask_scores
+from pipeline.evaluation.references import find_references, read_reference
+from pipeline.evaluation.rounds import score_rounds
+from pipeline.evaluation.score import Files
+from pipeline.io.atomic import read_json
+from pipeline.io.masks import read_keep_mask
+from pipeline.io.paths import ScenePaths
+from pipeline.io.scene import read_images_json
+
+COVERED = 0.05
+
+
+def table(root: Path, scene: str) -> list[str]:
+    """The lines of one scene."""
+    paths = ScenePaths(root, scene)
+    records = read_images_json(paths.images)
+    clean = find_references(paths.truth / "clean", records) or {}
+    coverage = find_references(paths.truth / "coverage", records) or {}
+    files = {
+        r.name: Files(r, paths.data / r.source, paths.images / r.name, paths.refine / r.name, None, None,
+                      None, clean.get(r.name), coverage.get(r.name))
+        for r in records
+    }  # fmt: skip
+    about = read_json(paths.refine / "refine.json", made_by="refine")
+    shares, counts = [], []
+    for name, one in files.items():
+        drop_mask = ~read_keep_mask(paths.masks / name, one.record.size)
+        shares.append(float(drop_mask.mean()))
+        if one.coverage is not None:
+            true = read_reference(one.coverage, one.record, one.source)[..., 0]
+            counts.append(mask_counts(drop_mask, true, COVERED))
+    drawn = {"coverage": float(np.mean(shares))}
+    drawn |= mask_scores(counts)._asdict() if counts else {}
+    lines = [_line(scene, "masks", drawn, "")]
+    for number, numbers in score_rounds(paths.refine, files, COVERED).items():
+        lines.append(_line(scene, number, numbers, about["rounds"][number]["glass"]))
+    return [*lines, f"| {scene} | ended: {about['why']} |"]
+
+
+def _line(scene: str, what: str, numbers: dict[str, float], glass: str) -> str:
+    names = ("coverage", "precision", "recall", "iou")
+    cells = [f"{numbers[name]:.3f}" if name in numbers else "–" for name in names]
+    psnr = f"{numbers['test_psnr']:.2f}" if "test_psnr" in numbers else "–"
+    return f"| {scene} | {what} | {' | '.join(cells)} | {psnr} | {glass} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--params", type=Path, default=Path("params.yaml"))
+    parser.add_argument("--run", action="store_true", help="run stages.refine of each scene first")
+    flags = parser.parse_args()
+    print(
+        "| scene | round | dropped | precision | recall | IoU | PSNR | glass |\n" + "|---" * 8 + "|"
+    )
+    for scene in flags.scenes:
+        if flags.run:
+            command = [sys.executable, "-m", "stages.refine", "--scene", scene]
+            subprocess.run([*command, "--params", str(flags.params)], check=True)
+        print("\n".join(table(flags.params.resolve().parent, scene)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
