@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -66,8 +67,10 @@ def _on_threads(tasks: dict[str, Delayed], label: str, _: str, workers: int) -> 
     threads = torch.get_num_threads() if torch is not None else 0
     try:
         bar = tqdm(total=len(tasks), desc=label, unit="image", leave=False)
-        with bar, Callback(posttask=lambda *_: bar.update()):
-            how = {"scheduler": "threads", "num_workers": workers}
+        # A pool of our own: leaving it waits for what still runs when a task fails, so that nothing
+        # is written into a folder that has been given up.
+        with ThreadPoolExecutor(workers) as pool, bar, Callback(posttask=lambda *_: bar.update()):
+            how = {"scheduler": "threads", "num_workers": workers, "pool": pool}
             results = dask.compute(*tasks.values(), optimize_graph=False, **how)
     finally:
         if torch is not None:
@@ -94,16 +97,28 @@ def _on_cluster(tasks: dict[str, Delayed], label: str, address: str, _: int) -> 
                 f"--scheduler {address}: the cluster has no workers.",
                 "Start `dask worker` with its address.",
             ) from None
-        futures = dict(zip(client.compute(list(tasks.values()), retries=2), tasks, strict=True))
-        results = {}
-        with tqdm(total=len(tasks), desc=label, unit="image", leave=False) as bar:
-            for future in as_completed(futures):
-                try:
-                    results[futures[future]] = future.result()
-                except KilledWorker as error:
-                    raise UserError(
-                        f"{label}: the workers died on {futures[future]} ({error}).",
-                        "Most often they ran out of memory: give them more, or fewer threads each.",
-                    ) from None
-                bar.update()
-    return {name: results[name] for name in tasks}
+        futures = client.compute(list(tasks.values()), retries=2)
+        try:
+            with tqdm(total=len(tasks), desc=label, unit="image", leave=False) as bar:
+                for future in as_completed(futures):
+                    future.result()
+                    bar.update()
+        except KilledWorker as error:
+            name = next(n for n, f in zip(tasks, futures, strict=True) if f is future)
+            raise UserError(
+                f"{label}: the workers died on {name} ({error}).",
+                "Most often they ran out of memory: give them more, or fewer threads each.",
+            ) from None
+        except BaseException:
+            _wait_for_running(client, futures)
+            raise
+        return dict(zip(tasks, client.gather(futures), strict=True))
+
+
+def _wait_for_running(client: Any, futures: list[Any]) -> None:
+    """Calls off what waits, then waits for what runs: it may still write into the caller's folder."""
+    from distributed import wait
+
+    running = {key for keys in client.processing().values() for key in keys}
+    client.cancel([one for one in futures if not one.done() and one.key not in running])
+    wait([one for one in futures if not one.cancelled()])

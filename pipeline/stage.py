@@ -19,6 +19,7 @@ import filelock
 from tqdm import tqdm
 
 from pipeline.errors import UserError
+from pipeline.io.atomic import disk_faults
 from pipeline.io.paths import ScenePaths
 from pipeline.params import Section, read_section
 
@@ -120,10 +121,12 @@ def _run(
     )
     params = read_section(params_file, name, params_type, job.scene, job.variant)
     work = job.paths.work(name)
-    work.mkdir(parents=True, exist_ok=True)
-    _log_to(work / "log.txt", job.verbose)
     try:
-        with filelock.FileLock(work / "lock", timeout=0):
+        with disk_faults(work):
+            work.mkdir(parents=True, exist_ok=True)
+            lock = filelock.FileLock(work / "lock", timeout=0).acquire()
+            _log_to(work / "log.txt", job.verbose)
+        with lock:
             closing = main(job, params)
     except filelock.Timeout:
         raise UserError(
@@ -132,7 +135,7 @@ def _run(
         ) from None
     except Exception:
         # The traceback belongs into the log as well: the terminal may be gone when someone asks.
-        log.debug("stage %s failed", name, exc_info=True)
+        log.error("stage %s failed", name, exc_info=True)
         raise
     if closing:
         log.info("%s: %s", name, closing)
@@ -178,6 +181,7 @@ def _log_to(path: Path, verbose: bool) -> None:
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     terminal = _AboveProgressBars(logging.DEBUG if verbose else logging.INFO)
     terminal.setFormatter(logging.Formatter("%(message)s"))
+    terminal.addFilter(lambda record: not record.exc_info)  # the runner tells it itself
     root.handlers = [file, terminal]
 
 

@@ -45,6 +45,7 @@ def main(job: Job, params: Params) -> str:
             {
                 record.name: (
                     job.paths.images / record.name,
+                    record.size,
                     fresh / f"{Path(record.name).stem}.exr",
                     weights,
                     digest,
@@ -61,7 +62,7 @@ def main(job: Job, params: Params) -> str:
         total: np.ndarray | None = None
         for record in records:
             found = read_map(fresh / f"{Path(record.name).stem}.exr").astype(np.float64)
-            total = found if total is None else _added(total, found, record.name)
+            total = found if total is None else total + found
         assert total is not None  # images.json lists at least one image
         write_map(fresh / "mean.exr", (total / len(records)).astype(np.float32), attributes)
     mean_share = float(np.mean(list(shares.values())))
@@ -78,14 +79,9 @@ def attributes_of(params: Params, digest: str) -> dict[str, str | float]:
     }
 
 
-def _added(total: np.ndarray, found: np.ndarray, name: str) -> np.ndarray:
-    if total.shape != found.shape:
-        raise ValueError(f"{name} has the shape {found.shape}, the images before it {total.shape}")
-    return total + found
-
-
 def attend_image(
     image: Path,
+    size: tuple[int, int],
     out: Path,
     weights: Path,
     digest: str,
@@ -94,7 +90,7 @@ def attend_image(
     attributes: dict[str, str | float],
 ) -> float:
     """Writes the map of one image (without a model: no drop anywhere); its share above 0.3."""
-    pixels = read_image(image)
+    pixels = read_image(image, size=size)
     found = np.zeros(pixels.shape[:2], np.float32)
     if params.model != "none":
         network = _network(weights, params.model, digest, device)

@@ -48,10 +48,17 @@ def main(job: Job, params: Params) -> str:
         coverage = map_named(
             write_mask,
             {
-                name: (attention, mean if fixed else None, t, fresh / name, params)
-                for name, attention in maps.items()
+                record.name: (
+                    _path(job, record),
+                    mean if fixed else None,
+                    t,
+                    fresh / record.name,
+                    params,
+                )
+                for record in records
             },
             job_label="masks",
+            scheduler=job.scheduler,
         )
         everything = [name for name, share in coverage.items() if share == 1.0]
         if len(everything) == len(coverage):
@@ -85,17 +92,21 @@ def main(job: Job, params: Params) -> str:
 
 
 def write_mask(
-    attention: np.ndarray, mean: np.ndarray | None, t: float, path: Path, params: Params
+    attention: Path, mean: np.ndarray | None, t: float, path: Path, params: Params
 ) -> float:
     """Writes one keep mask and returns the share of pixels it drops."""
-    drop_mask = masking.drop_mask_of(attention, mean, t, params.mean_alone)
+    drop_mask = masking.drop_mask_of(read_map(attention), mean, t, params.mean_alone)
     drop_mask = masking.dilate(masking.without_specks(drop_mask, params.min_area), params.dilation)
     write_keep_mask(path, ~drop_mask)
     return float(drop_mask.mean())
 
 
+def _path(job: Job, record: ImageRecord) -> Path:
+    return job.paths.attention / f"{record.stem}.exr"
+
+
 def _read_attention(job: Job, record: ImageRecord) -> np.ndarray:
-    path = job.paths.attention / f"{record.stem}.exr"
+    path = _path(job, record)
     attention = read_map(path)
     if attention.shape != (record.height, record.width):
         raise UserError(

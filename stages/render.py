@@ -73,7 +73,7 @@ def _one_view(view: View, split: str, fill: tuple[float, float], device: str, *w
     seen = _render(nerf, device, view, view.cam_from_world, 1.0)
     write_image(out / ("test" if split == "test" else "input") / view.name, seen.rgb)
     write_depth(out / "depth" / f"{Path(view.name).stem}.exr", seen.depth)
-    photo = read_image(images / view.name)
+    photo = read_image(images / view.name, size=(view.width, view.height))
     keep_mask = _keep_mask(masks, view.name, seen.depth)
     mixed = composite_photo(photo, seen.rgb, keep_mask, feather_px=fill[0], reach_px=fill[1])
     write_image(out / "composite" / view.name, mixed)

@@ -28,7 +28,15 @@ _POOLED_BEFORE = (3, 6)
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 # What reading a wrong file as weights can raise.
-_UNFIT = (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError)
+_UNFIT = (
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    OSError,
+)
 SMALLEST_SIDE = 31  # below it the second pooling has nothing to pool
 
 

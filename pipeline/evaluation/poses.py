@@ -37,7 +37,9 @@ def read_true_cameras(
         }
         unit = str(content.get("unit", "units of the true cameras"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"{path} is not a list of true cameras ({error!r}).") from None
+        raise UserError(
+            f"{path} is not a list of true cameras ({error!r}).", "Restore the file."
+        ) from None
     cameras = {
         record.name: np.linalg.matrix_power(_QUARTER, record.turned // 90 % 4) @ frames[record.stem]
         for record in records

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import UserError
 from pipeline.evaluation import flip
 from pipeline.evaluation.image import psnr, ssim
 from pipeline.evaluation.lpips import Lpips, load_lpips, lpips
@@ -92,13 +91,7 @@ def _selected(
 
 
 def _read_view(path: Path, record: ImageRecord, made_by: str = "render") -> np.ndarray:
-    view = read_image(path, made_by)
-    if view.shape[1::-1] != record.size:
-        raise UserError(
-            f"{path} is {view.shape[1]}x{view.shape[0]}, not {record.width}x{record.height}.",
-            f"Run `python -m stages.{made_by}` again.",
-        )
-    return view
+    return read_image(path, made_by, record.size)
 
 
 @lru_cache(maxsize=1)

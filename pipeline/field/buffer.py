@@ -45,7 +45,15 @@ class Batch(NamedTuple):
 
 
 def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list[PosedPhoto]:
-    """The images that are not held out, in their order; UserError when there is none."""
+    """The images that are not held out, in their order.
+
+    UserError when there is none, or nothing between ``near`` and ``far``.
+    """
+    if not 0 < near < far:
+        raise UserError(
+            f"The poses bound the scene's depth by {near:g} and {far:g}: nothing lies between.",
+            "Run `python -m stages.poses` again.",
+        )
     photos = [
         PosedPhoto(
             image.record.name,
@@ -86,7 +94,7 @@ class RayBuffer:
         if order.size == 0:
             raise UserError(
                 "Every pixel of every photo is masked: nothing is left to fit.",
-                hint="raise masks.threshold or lower masks.dilation",
+                hint="Raise masks.threshold or lower masks.dilation.",
             )
         self.seed, self.device = seed, device
         self.count, self.photos = int(order.size), len(photos)

@@ -114,8 +114,9 @@ def restore(
         field = build(description["model"], description["config"], space, 0)
         field.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in tensors.items()})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split()).rstrip(".")
         raise UserError(
-            f"The fitted field cannot be read back: {error}.",
+            f"The fitted field cannot be read back: {reason}.",
             hint="Run `python -m stages.nerf` again.",
         ) from None
     return field

@@ -105,7 +105,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def read_json(path: Path, made_by: str = "") -> Any:
     """The content of a JSON file; UserError when it is missing or damaged, naming the stage that makes it."""
-    hint = f"Run `python -m stages.{made_by}` first." if made_by else ""
+    hint = f"Run `python -m stages.{made_by}` first." if made_by else "Restore the file."
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

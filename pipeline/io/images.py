@@ -35,14 +35,24 @@ class PhotoInfo:
     focal_px: float | None
 
 
-def read_image(path: Path, made_by: str = "ingest") -> np.ndarray:
-    """An (H, W, 3) float32 RGB image in [0, 1] from a file that a stage wrote."""
+def read_image(
+    path: Path, made_by: str = "ingest", size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """An (H, W, 3) float32 RGB image in [0, 1] from a file that a stage wrote.
+
+    UserError when it is missing or damaged, or not of `size` (width, height).
+    """
     if not path.is_file():
         raise UserError(f"{path} does not exist.", f"Run `python -m stages.{made_by}` first.")
     pixels = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(
             f"{path} is not a readable image.", f"Run `python -m stages.{made_by}` again."
+        )
+    if size is not None and pixels.shape[1::-1] != size:
+        raise UserError(
+            f"{path} is {pixels.shape[1]}x{pixels.shape[0]}, not {size[0]}x{size[1]}.",
+            f"Run `python -m stages.{made_by}` again.",
         )
     return pixels.astype(np.float32) / np.float32(255)
 

@@ -36,7 +36,7 @@ def read_posed_images(
         view = views.get(record.name)
         if view is None:
             continue
-        rgb = read_image(images / record.name)
+        rgb = read_image(images / record.name, size=(view.width, view.height))
         keep_mask = np.ones(rgb.shape[:2], bool)
         if masks is not None:
             keep_mask = read_keep_mask(masks / record.name, (view.width, view.height))

@@ -35,4 +35,6 @@ def load_tensors(path: Path, hint: str = "") -> tuple[dict[str, np.ndarray], dic
             metadata = json.loads(header["metadata"]) if "metadata" in header else header
             return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
     except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{path} is not a readable safetensors file ({error}).", hint) from None
+        raise UserError(
+            f"{path} is not a readable safetensors file ({error}).", hint.replace("first", "again")
+        ) from None

@@ -101,13 +101,25 @@ def read_transforms(path: Path) -> dict[str, View]:
             "Run `python -m stages.poses` again.",
         ) from None
     for view in views:
-        rotation = view.cam_from_world[:3, :3]
-        if (
-            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-            or np.linalg.det(rotation) < 0
-        ):
-            raise UserError(f"{path}: the pose of {view.name} is not a rotation and a translation.")
+        problem = _problem(view)
+        if problem:
+            raise UserError(
+                f"{path}: {view.name} has {problem}.", "Run `python -m stages.poses` again."
+            )
     return {view.name: view for view in views}
+
+
+def _problem(view: View) -> str:
+    """What is wrong with a view, or nothing."""
+    numbers = [getattr(view, field) for field in _NUMBERS.values()]
+    if not np.isfinite([*numbers, *view.cam_from_world.ravel()]).all():
+        return "numbers that are not finite"
+    rotation = view.cam_from_world[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        return "a pose that is not a rotation and a translation"
+    if min(view.fx, view.fy, view.width, view.height) <= 0:
+        return "a focal length or size that is not positive"
+    return ""
 
 
 def _view(frame: Mapping[str, Any]) -> View:

@@ -100,7 +100,9 @@ def test_threads_and_order_change_nothing(
     attributes = attributes_of(PARAMS, digest)
     for k in (2, 0, 1):
         image = root / f"artifacts/made/images/view_{k:02d}.png"
-        attend_image(image, alone / f"{k}.exr", weights, digest, "cpu", PARAMS, attributes)
+        attend_image(
+            image, SIZES[::-1], alone / f"{k}.exr", weights, digest, "cpu", PARAMS, attributes
+        )
         assert (alone / f"{k}.exr").read_bytes() == (folder / f"view_{k:02d}.exr").read_bytes()
 
 

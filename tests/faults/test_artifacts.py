@@ -1,0 +1,163 @@
+"""Artifacts that were damaged or swapped between two stages are refused by name, with the stage to run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from pipeline.io.images import write_image
+from pipeline.io.maps import write_map
+from pipeline.io.masks import write_keep_mask
+from tests.faults.workshop import Workshop
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _text(path: Path) -> None:
+    path.write_text("rain, rain, go away")
+
+
+@pytest.mark.parametrize("damage", [_cut, _empty, _text])
+@pytest.mark.parametrize(
+    ("stage", "name", "maker"),
+    [
+        ("attention", "images/images.json", "ingest"),
+        ("attention", "images/view_2.png", "ingest"),
+        ("masks", "attention/view_2.exr", "attention"),
+        ("poses", "masks/view_2.png", "masks"),
+        ("nerf", "poses/transforms.json", "poses"),
+        ("nerf", "masks/view_2.png", "masks"),
+        ("nerf", "images/view_2.png", "ingest"),
+        ("render", "nerf/field.json", "nerf"),
+        ("render", "nerf/field.safetensors", "nerf"),
+        ("evaluate", "views/test/view_0.png", "render"),
+        ("evaluate", "views/composite/view_2.png", "render"),
+        ("evaluate", "masks/view_2.png", "masks"),
+        ("report", "metrics.json", "evaluate"),
+        ("report", "attention/view_2.exr", "attention"),
+    ],
+)
+def test_damaged_files(
+    whole: Workshop, stage: str, name: str, maker: str, damage: Callable[[Path], None]
+) -> None:
+    damage(whole.artifacts / name)
+    whole.refuses(stage, Path(name).name, f"python -m stages.{maker}` again")
+
+
+def _frame(change: Callable[[dict[str, Any]], Any]) -> Callable[[Workshop], None]:
+    def do(workshop: Workshop) -> None:
+        path = workshop.artifacts / "poses/transforms.json"
+        content = json.loads(path.read_text())
+        change(content["frames"][2])
+        path.write_text(json.dumps(content))
+
+    return do
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda frame: frame.pop("transform_matrix"),
+        lambda frame: frame.pop("near"),
+        lambda frame: frame.update(fl_x="wide"),
+        lambda frame: frame.update(fl_x=float("nan")),
+        lambda frame: frame.update(fl_y=0.0),
+        lambda frame: frame.update(transform_matrix=[[1, 0, 0, 0]] * 4),
+        lambda frame: frame.update(transform_matrix=np.full((4, 4), np.nan).tolist()),
+        lambda frame: frame.update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()),
+    ],
+)
+def test_poses_that_are_none(whole: Workshop, change: Callable[[dict[str, Any]], Any]) -> None:
+    _frame(change)(whole)
+    whole.refuses("nerf", "transforms.json")
+
+
+def test_depths_that_hold_nothing(whole: Workshop) -> None:
+    _frame(lambda frame: frame.update(near=-1.0))(whole)
+    whole.refuses("nerf", "nothing lies between", "python -m stages.poses")
+
+
+def test_no_pose_at_all(whole: Workshop) -> None:
+    path = whole.artifacts / "poses/transforms.json"
+    path.write_text(json.dumps({"frames": []}))
+    whole.refuses("nerf", "pose")
+
+
+def test_attention_of_another_size(whole: Workshop) -> None:
+    write_map(whole.artifacts / "attention/view_2.exr", np.zeros((90, 120), np.float32))
+    whole.refuses("masks", "120x90", "240x180", "python -m stages.attention")
+
+
+def test_attention_that_is_no_number(whole: Workshop) -> None:
+    path = str(whole.artifacts / "attention/view_2.exr")
+    out = oiio.ImageOutput.create(path)
+    spec = oiio.ImageSpec(240, 180, 1, "half")
+    assert out.open(path, spec)
+    assert out.write_image(np.full((180, 240, 1), np.nan, np.float32)) and out.close()
+    whole.refuses("masks", "view_2.exr", "NaN")
+
+
+@pytest.mark.parametrize("stage", ["poses", "nerf", "render", "evaluate"])
+def test_a_mask_of_another_size(whole: Workshop, stage: str) -> None:
+    write_keep_mask(whole.artifacts / "masks/view_2.png", np.ones((90, 120), bool))
+    whole.refuses(stage, "view_2.png", "120x90", "240x180")
+
+
+@pytest.mark.parametrize("stage", ["nerf", "render", "evaluate"])
+@pytest.mark.parametrize("values", [np.full((180, 240), 7), np.full((180, 240, 3), 255)])
+def test_a_mask_that_is_none(whole: Workshop, stage: str, values: np.ndarray) -> None:
+    cv2.imwrite(str(whole.artifacts / "masks/view_2.png"), values.astype(np.uint8))
+    whole.refuses(stage, "masks/view_2.png")
+
+
+@pytest.mark.parametrize("stage", ["attention", "poses", "nerf", "render"])
+def test_an_image_of_another_size(whole: Workshop, stage: str) -> None:
+    write_image(whole.artifacts / "images/view_2.png", np.zeros((90, 120, 3)))
+    whole.refuses(stage, "view_2.png")
+
+
+def test_masks_that_leave_nothing_to_fit(whole: Workshop) -> None:
+    for path in (whole.artifacts / "masks").glob("*.png"):
+        write_keep_mask(path, np.zeros((180, 240), bool))
+    whole.refuses("nerf", "mask")
+
+
+def test_a_field_of_other_sizes(whole: Workshop) -> None:
+    path = whole.artifacts / "nerf/field.json"
+    path.write_text(path.read_text().replace('"levels": 2', '"levels": 3'))
+    whole.refuses("render", "field", "python -m stages.nerf")
+
+
+def test_a_reference_of_another_size(whole: Workshop) -> None:
+    write_image(whole.data / "truth/clean/view_2.png", np.zeros((90, 100, 3)))
+    whole.refuses("evaluate", "truth/clean/view_2.png", "100x90")
+
+
+def test_a_reference_that_is_missing(whole: Workshop) -> None:
+    (whole.data / "truth/clean/view_2.png").unlink()
+    whole.refuses("evaluate", "truth/clean", "view_2.png")
+
+
+def test_true_cameras_that_are_none(whole: Workshop) -> None:
+    _text(whole.data / "truth/cameras.json")
+    whole.refuses("evaluate", "truth/cameras.json")
+
+
+def test_a_backbone_that_is_none(whole: Workshop) -> None:
+    whole.set("evaluate", lpips_backbone="weights/alexnet.pth")
+    whole.refuses("evaluate", "alexnet.pth")
+    _text(whole.root / "weights/alexnet.pth")
+    whole.refuses("evaluate", "alexnet.pth")
