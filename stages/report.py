@@ -10,7 +10,7 @@ from pydantic import Field
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir, read_json, write_text
 from pipeline.io.paths import ScenePaths
-from pipeline.io.scene import ImageRecord, read_images_json
+from pipeline.io.scene import ImageRecord, read_images_json, read_origin
 from pipeline.parallel import map_named
 from pipeline.report import gather, notes, numbers
 from pipeline.report.page import Page, Photo, render
@@ -76,6 +76,8 @@ def main(job: Job, params: Params) -> str:
         ),
         poses_note=notes.poses_note(account, len(records)),
         lost=lost,
+        tried=gather.attempts(account),
+        intake=read_origin(paths.images).said,
         video=film,
         video_missing=film_missing,
         missing=numbers.missing(metrics),

@@ -70,12 +70,16 @@ def bars(
 
 
 def camera_map(
-    cameras: Mapping[str, np.ndarray], held_out: set[str], *, size: tuple[int, int]
+    cameras: Mapping[str, np.ndarray],
+    held_out: set[str],
+    *,
+    size: tuple[int, int],
+    side: bool = False,
 ) -> Markup:
     """The cameras from above: where each stands and looks, held-out ones in the second colour.
 
     cameras: `cam_from_world` (4, 4) by name. "Above" is against the mean of the cameras' downward
-    axes.
+    axes. `side`: seen from the right instead, up staying up.
     """
     if not cameras:
         return Markup("")
@@ -88,7 +92,8 @@ def camera_map(
     if np.linalg.norm(ahead) < 1e-6:  # they look all around
         ahead = np.cross(up, stack[0, :3, 0])
     ahead /= np.linalg.norm(ahead)
-    plane = np.stack([np.cross(ahead, up), -ahead])  # right and, downwards in the drawing, back
+    # Right and, downwards in the drawing, back; from the side, ahead and down.
+    plane = np.stack([ahead, -up] if side else [np.cross(ahead, up), -ahead])
     flat = {name: plane @ world[:3, 3] for name, world in worlds.items()}
     spread = np.stack(list(flat.values()))
     extent = np.maximum(np.ptp(spread, axis=0), 1e-9)
@@ -97,10 +102,10 @@ def camera_map(
     parts = []
     for name, world in worlds.items():
         x, y = (flat[name] - middle) * scale + np.array(size) / 2
-        look, side = plane @ world[:3, 2], plane @ world[:3, 0]
+        look, wide = plane @ world[:3, 2], plane @ world[:3, 1 if side else 0]
         tips = [
             (x, y),
-            *((x + s[0], y + s[1]) for s in (22 * look + 9 * side, 22 * look - 9 * side)),
+            *((x + s[0], y + s[1]) for s in (22 * look + 9 * wide, 22 * look - 9 * wide)),
         ]
         shape = " ".join(f"{px:.1f},{py:.1f}" for px, py in tips)
         kind = "s1" if name in held_out else "s0"
@@ -108,7 +113,7 @@ def camera_map(
             f'<g class="camera {kind}"><polygon points="{shape}"/>'
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2"/><title>{escape(name)}</title></g>'
         )
-    return _svg(parts, size, "Cameras seen from above")
+    return _svg(parts, size, "Cameras seen from the side" if side else "Cameras seen from above")
 
 
 class _Frame:

@@ -119,6 +119,20 @@ def lost_images(account: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(str(image["name"]), str(image["reason"])) for image in account.get("lost", [])]
 
 
+def attempts(account: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and results of the attempts at poses, the one that is used marked; none for a single one."""
+    tried = account.get("tried", [])
+    if len(tried) < 2:
+        return []
+    return [
+        (
+            str(one["label"]),
+            f"{one['registered']} photos placed" + (", used" if one.get("chosen") else ""),
+        )
+        for one in tried
+    ]
+
+
 def video(path: Path) -> tuple[str, str]:
     """(`data:` address of the video, ""), or ("", why there is none)."""
     if not path.is_file():

@@ -16,6 +16,12 @@ for (const article of document.querySelectorAll("[data-card]")) {
   show(pick("composite") || pick("clean") || pick("mask") || pick("photo"));
   for (const button of buttons) button.addEventListener("click", () => show(button));
 }
+// The filmstrip shows the cleaned photo where there is one; a click leads to its card.
+for (const link of document.querySelectorAll("[data-film]")) {
+  const card = document.getElementById("photo-" + link.dataset.film);
+  const picture = (kind) => card.querySelector(`[data-kind=${kind}] img`);
+  link.firstElementChild.src = (picture("composite") || picture("photo")).src;
+}
 const hero = document.querySelector("[data-hero]");
 if (hero) {
   const source = document.getElementById(hero.dataset.hero);

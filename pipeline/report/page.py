@@ -50,6 +50,8 @@ class Page:
     masks_note: str
     poses_note: str
     lost: list[tuple[str, str]]
+    tried: list[tuple[str, str]]
+    intake: list[str]
     video: str
     video_missing: str
     missing: list[tuple[str, str]]

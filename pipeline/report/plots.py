@@ -49,4 +49,5 @@ def charts(
         "cleaned": bars(cleaned, title="PSNR of photos", unit="dB", size=WIDE),
         "coverage": bars(shares, title="Coverage", unit="%", size=WIDE),
         "cameras": camera_map(poses, test, size=MAP),
+        "cameras_side": camera_map(poses, test, size=MAP, side=True),
     }  # fmt: skip

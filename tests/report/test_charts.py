@@ -62,3 +62,12 @@ def test_cameras_stand_as_seen_from_above():
     assert places["left"][3] < places["left"][2], "ahead is up the page"
     assert (places["left"][0], places["right"][0]) == ("s0", "s1")
     assert camera_map({}, set(), size=SIZE) == ""
+
+
+def test_from_the_side_up_is_up() -> None:
+    """Two cameras, one a metre above the other (y points down): its dot is drawn higher."""
+    low, high = np.eye(4), np.eye(4)
+    high[1, 3] = 1.0  # its centre lies at y = -1
+    drawn = camera_map({"low": low, "high": high}, set(), size=(300, 200), side=True)
+    heights = [float(y) for y in re.findall(r'<circle cx="[\d.]+" cy="([\d.]+)"', drawn)]
+    assert heights[1] < heights[0]

@@ -101,7 +101,7 @@ def test_the_page_shows_numbers_of_both_fits_and_the_gap(root, html):
     for text in (f"{own:.2f}", f"{theirs:.2f}", f"{own - theirs:+.2f}", "8/9"):
         assert f">{text}<" in html
     assert "names no AlexNet weights" in html
-    assert html.count("<svg") == 6
+    assert html.count("<svg") == 7
     assert "data:video/mp4" in html
 
 
@@ -150,4 +150,22 @@ def test_turned_photos_stand_upright(tmp_path):
         path = paths.truth / kind / "view_01.png"
         cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -3))
     html = make(tmp_path, variants=(None,))
-    assert html.count(f"--ratio: {48 / 64:.5f}") == 2  # its card and its slider
+    assert html.count(f"--ratio: {48 / 64:.5f}") == 3  # its card, its slider, the filmstrip
+
+
+def test_the_page_tells_what_was_tried_and_what_came_in(tmp_path):
+    paths = fabricate(tmp_path, count=3, lost=0)
+    account = json.loads((paths.poses / "poses.json").read_text())
+    account["tried"] = [
+        {"label": "first", "registered": 1, "chosen": False},
+        {"label": "global mapper", "registered": 3, "chosen": True},
+    ]
+    (paths.poses / "poses.json").write_text(json.dumps(account))
+    listed = json.loads((paths.images / "images.json").read_text())
+    listed["origin"] = {"said": ["the photos have mixed sizes <...>"]}
+    (paths.images / "images.json").write_text(json.dumps(listed))
+    html = make(tmp_path, variants=(None,))
+    parse(html)
+    assert "<dt>global mapper</dt><dd>3 photos placed, used</dd>" in html
+    assert "mixed sizes &lt;...&gt;" in html
+    assert html.count('data-film="') == 3
