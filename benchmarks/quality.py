@@ -114,7 +114,7 @@ def measure(
     """Fit one row's input and compare the held-out views; ``seen`` masks by stem, may be empty."""
     kind, masks, poses = ROWS[row]
     views = scene.views[poses]
-    near = min(view.near for view in views.values())
+    near = min(view.near for view in views.values()) * settings["near_factor"]
     far = max(view.far for view in views.values()) * settings["far_factor"]
     stems = [stem for stem in scene.rainy if stem in views]
     held_out = [stem for i, stem in enumerate(scene.rainy) if i % 8 == 0 and stem in views]

@@ -43,6 +43,7 @@ class Params(Section):
     trim: Annotated[float, Field(ge=0, le=0.5)]
     rate: Annotated[float, Field(gt=0, le=10)]
     exposure: bool
+    near_factor: Annotated[float, Field(gt=0, le=10)]
     far_factor: Annotated[float, Field(ge=1, le=100)]
     save_every: Annotated[int, Field(ge=1)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -53,8 +54,10 @@ def main(job: Job, params: Params) -> str:
     views = read_transforms(job.paths.poses / "transforms.json")
     if not views:
         raise UserError("No photo has a pose.", "See poses/poses.json for why.")
-    near = min(view.near for view in views.values())
+    near = min(view.near for view in views.values()) * params.near_factor
     far = max(view.far for view in views.values()) * params.far_factor
+    if near >= far:
+        raise UserError("Nothing is left between near and far.", "Lower nerf.near_factor.")
     masks = job.paths.refine if params.use_masks else None
     photos = photos_to_fit(read_posed_images(job.paths.images, masks, views), near, far)
     settings = params.model_dump(include=SETTINGS)

@@ -10,7 +10,7 @@ import torch
 from pipeline.field.base import Field, Rays
 from pipeline.geometry.rays import pixel_rays
 
-CHUNK = 8192
+CHUNK = 2048  # what a core keeps in its cache; larger chunks are slower
 
 
 class RenderedView(NamedTuple):
