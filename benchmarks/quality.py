@@ -47,7 +47,17 @@ ROWS = {
     "true-sfm": ("rainy", "true", "sfm"),
     "detector-sfm": ("rainy", "detector", "sfm"),
 }
-FIELD = ("samples", "levels", "features", "table_log2", "distortion", "resolution", "seed", "space")
+FIELD = (
+    "samples",
+    "levels",
+    "features",
+    "table_log2",
+    "distortion",
+    "trim",
+    "resolution",
+    "seed",
+    "space",
+)
 
 
 @dataclass(frozen=True)
@@ -137,7 +147,8 @@ def measure(
     buffer = RayBuffer(photos, settings["seed"])
     begin = time.perf_counter()
     fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
-        seed=settings["seed"], threads=threads)  # fmt: skip
+        seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
+        threads=threads)  # fmt: skip
     seconds = time.perf_counter() - begin
     torch.set_num_threads(threads)
     renders = {}
