@@ -184,6 +184,25 @@ def _cases(demo: Path | None, scenes: list[Path], photos: Path | None, out: Path
         yield from (_wetted(replace(clean, truth=truth), coverage) for coverage in HEAVY)
 
 
+def table(out: Path) -> str:
+    """A Markdown table of all results in `out`."""
+    rows = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
+    order = {way: index for index, way in enumerate(WAYS)}
+    lines = [
+        "| capture | way | masked | placed | points | error, px | turn, ° (largest) | place, % (largest) |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in sorted(rows, key=lambda row: (row["case"], order[row["way"]])):
+        cells = [row["case"], row["way"], f"{row['masked']:.0%}" if "masked" in row else ""]
+        cells += [f"{row['registered']}/{row['total']}", str(row.get("points", ""))]
+        cells.append(f"{row['reprojection_px']:.2f}" if "reprojection_px" in row else "")
+        for name, form in (("rotation_deg", ".3f"), ("centre_percent", ".2f")):
+            known = name in row
+            cells.append(f"{row[name]:{form}} ({row[name + '_max']:{form}})" if known else "")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -192,7 +211,11 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])
     parser.add_argument("--photos", type=Path)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--table", action="store_true", help="only print what DIR holds")
     flags = parser.parse_args()
+    if flags.table:
+        print(table(flags.out))
+        return
     for case in _cases(flags.demo, flags.scenes, flags.photos, flags.out):
         for way in WAYS:
             file = flags.out / f"{case.name}-{way}.json"

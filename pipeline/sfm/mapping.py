@@ -9,9 +9,9 @@ from pathlib import Path
 import pycolmap
 
 from pipeline.sfm.database import Progress
+from pipeline.sfm.model import SMALLEST_MODEL
 from pipeline.sfm.result import Settings
 
-SMALLEST_MODEL = 3
 LOOSE_MATCHES = 10
 LOOSE_INLIERS = 15
 LOOSE_INLIER_RATIO = 0.15

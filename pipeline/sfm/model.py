@@ -16,6 +16,8 @@ from pipeline.io.transforms import View
 
 WIDEST_DEG = 170.0
 NARROWEST_DEG = 2.0
+MOST_BENT = 0.6  # |k1| r^2 in the corner; the widest lenses of action cameras reach about 0.4
+SMALLEST_MODEL = 3
 DEPTH_PERCENTILES = (1.0, 99.0)
 SURE_VIEWS = 3  # a wrong match of two photos makes a point at any depth; a third photo rules it out
 
@@ -23,6 +25,20 @@ SURE_VIEWS = 3  # a wrong match of two photos makes a point at any depth; a thir
 def largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
     """The model with the most registered images, then the most points; the first of equals."""
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+
+
+def usable(model: pycolmap.Reconstruction, total: int) -> bool:
+    """Whether a model of some of `total` images says anything: enough of them, through a possible lens.
+
+    A few photos of drops on the lens agree on scenes that no lens shows: two photos, k1 in the tens.
+    """
+    if model.num_reg_images() < min(SMALLEST_MODEL, total):
+        return False
+    for camera in model.cameras.values():
+        focal, cx, cy, k1 = camera.params
+        if focal <= 0 or abs(k1) * ((cx / focal) ** 2 + (cy / focal) ** 2) > MOST_BENT:
+            return False
+    return True
 
 
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:

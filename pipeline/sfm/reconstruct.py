@@ -21,6 +21,7 @@ from pipeline.sfm.model import (
     largest,
     points_of,
     registered_names,
+    usable,
     views_of,
 )  # fmt: skip
 from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
@@ -106,6 +107,7 @@ def reconstruct(
         models = map_images(
             database, image_dir, work_dir, len(names), attempt, seed=seed, progress=report
         )
+        models = [model for model in models if usable(model, len(names))]
         tries.append(_Try(label, attempt, models, matching))
         log.info("%s: %d of %d photos placed", label, tries[-1].registered, len(names))
         if best is None or tries[-1].beats(best):

@@ -18,7 +18,7 @@ from pipeline.io.images import read_image, write_image
 from pipeline.io.masks import write_keep_mask
 from pipeline.sfm import Settings, reconstruct, write_sparse
 from pipeline.sfm.mapping import map_images
-from pipeline.sfm.model import largest, views_of
+from pipeline.sfm.model import largest, usable, views_of
 from pipeline.sfm.reconstruct import ladder
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
@@ -189,6 +189,23 @@ def test_one_photo_taken_several_times_is_refused(scene, tmp_path):
         shutil.copy(scene.images / scene.names[0], tmp_path / name)
     with pytest.raises(UserError, match=r"could be placed|cannot be right"):
         solve(tmp_path, names, tmp_path / "w", retry=False)
+
+
+@pytest.mark.parametrize(
+    ("count", "k1", "good"), [(3, 0.1, True), (2, 0.1, False), (3, 9.0, False)]
+)
+def test_models_of_two_photos_or_an_impossible_lens_count_for_nothing(count, k1, good):
+    """At f = 220 the corner of 240 x 180 lies at r^2 = (120^2 + 90^2) / 220^2 = 0.46."""
+    model = pycolmap.Reconstruction()
+    params = [FOCAL, WIDTH / 2, HEIGHT / 2, k1]
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params, camera_id=1
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for number in range(1, count + 1):
+        image = pycolmap.Image(name=f"{number}", camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    assert usable(model, 20) == good
 
 
 def test_a_single_photo_is_refused(scene, tmp_path):
