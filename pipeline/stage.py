@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib
 import logging
 import os
 import signal
@@ -90,6 +91,9 @@ def run(
     """
     signal.signal(signal.SIGTERM, _terminate)
     _die_with_dvc()
+    stage = _by_its_name(main)
+    if stage is not None:
+        params_type, main = stage.Params, stage.main
     try:
         parser = _parser(name)
         if add_flags is not None:
@@ -107,6 +111,17 @@ def run(
     except KeyboardInterrupt:
         print(f"{name}: interrupted; nothing half-written is left.", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+def _by_its_name(main: Callable[..., Any]) -> Any:
+    """The module that runs as `__main__`, imported by its own name; None when it runs by that.
+
+    What a stage sends to a cluster is then found there by name: `__main__` is another one there.
+    """
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    if main.__module__ != "__main__" or spec is None:
+        return None
+    return importlib.import_module(spec.name)
 
 
 def _run(

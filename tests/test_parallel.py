@@ -85,8 +85,3 @@ def test_a_fault_on_the_cluster_names_its_item(tmp_path: Path, cluster: str) -> 
     (tmp_path / "a.jpg").write_text("no photo")
     with pytest.raises(UserError, match=r"a\.jpg is not an image"):
         map_named(examine, {"a.png": (tmp_path / "a.jpg",)}, job_label="test", scheduler=cluster)
-
-
-def test_no_scheduler_is_a_sentence() -> None:
-    with pytest.raises(UserError, match="no Dask scheduler answers"):
-        map_named(_square, {"a": (1,)}, job_label="test", scheduler="tcp://127.0.0.1:9")
