@@ -42,8 +42,8 @@ class Scene:
 
     def __init__(self, job: Job) -> None:
         self.paths = job.paths
-        refined = job.paths.artifacts / "refine"
-        masks = refined if refined.is_dir() else job.paths.masks
+        refined, first = job.paths.refine, job.paths.masks
+        masks = refined if refined.is_dir() else first
         views = read_transforms(job.paths.poses / "transforms.json")
         self.images = read_posed_images(job.paths.images, masks if masks.is_dir() else None, views)
         if not self.images:

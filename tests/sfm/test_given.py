@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 import zlib  # noqa: F401
 from pathlib import Path
@@ -10,12 +11,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from ruamel.yaml import YAML
 
 from pipeline.errors import UserError
 from pipeline.io.capture import find_capture
 from pipeline.io.images import write_image
-from pipeline.io.transforms import View
+from pipeline.io.masks import read_keep_mask, write_keep_mask
+from pipeline.io.transforms import View, read_transforms, write_transforms
 from pipeline.sfm import Settings, read_colmap, triangulate
+from pipeline.stage import Job
+from stages import ingest, masks, poses
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 SETTINGS = Settings(
@@ -131,3 +136,27 @@ def test_a_model_of_other_photos_and_a_damaged_one_are_refused(scene, tmp_path):
     (tmp_path / "images.bin").write_bytes(b"\x07\x00")
     with pytest.raises(UserError, match="not a readable COLMAP model"):
         read_colmap(tmp_path, [scene.images / "v0.png"])
+
+
+def test_a_capture_with_poses_and_masks_goes_through_the_stages(scene, tmp_path):
+    """ingest, masks and poses pass on what nerfstudio's file says, images scaled to half."""
+    data = tmp_path / "data/made"
+    shutil.copytree(scene.images, data / "images")
+    keep_mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    keep_mask[:40, :60] = False
+    for name in scene.names:
+        write_keep_mask(data / "masks" / name, keep_mask)
+    write_transforms(data / "transforms.json", true_views(scene).values(), beside="")
+    job = Job(tmp_path, "made", None, "cpu", None, False)
+    params = YAML(typ="safe").load((Path(__file__).parents[2] / "params.yaml").read_text())
+    ingest.main(job, ingest.Params(**{**params["ingest"], "max_size": WIDTH // 2}))
+    assert "came with the photos" in masks.main(job, masks.Params(**params["masks"]))
+    poses.main(job, poses.Params(**params["poses"]))
+    assert not read_keep_mask(job.paths.masks / "v0.png", (WIDTH // 2, HEIGHT // 2))[:20, :30].any()
+    views = read_transforms(job.paths.poses / "transforms.json")
+    for name, view in views.items():
+        assert np.allclose(view.cam_from_world, scene.cams[name], atol=1e-9)
+        assert (view.fx, view.cx, view.cy) == (FOCAL / 2, WIDTH / 4, HEIGHT / 4)
+        assert 0 < view.near < view.far
+    account = json.loads((job.paths.poses / "poses.json").read_text())
+    assert account["tried"][0]["label"] == "poses as given" and account["lost"] == []
