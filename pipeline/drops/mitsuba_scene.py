@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -50,54 +49,66 @@ class Baked:
     lights: list[Array]
 
 
-@lru_cache(maxsize=1)
-def _integrator() -> Any:
-    """Instance of the integrator that shades by baked light behind any chain of water surfaces."""
+def _trace(scene: Any, ray: Any, sampler: Any) -> tuple[Any, Any, Any, Any]:
+    """Radiance behind any chain of water surfaces, and of the first surface: is it water, its
+
+    distance if it is solid, and whether it is. Texture times baked light ends the chain.
+    """
     import drjit as dr
 
     mi = mitsuba()
 
-    class BakedLight(mi.SamplingIntegrator):  # type: ignore[name-defined]
-        """Specular chain, then texture times baked light; AOVs alpha, distance, hit."""
+    def more(ray: Any, going: Any, event: Any, *_: Any) -> Any:
+        return going & (event < MAX_EVENTS)
 
-        def __init__(self, props: Any) -> None:
-            super().__init__(props)
+    def follow(
+        ray: Any, going: Any, event: Any, weight: Any, colour: Any,
+        alpha: Any, distance: Any, hit: Any, sampler: Any,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        si = scene.ray_intersect(ray, going)
+        bsdf = si.bsdf(ray)
+        water = going & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        ended = going & ~water
+        colour = colour + dr.select(ended, weight * hit_radiance(scene, ray, si, ended), 0)
+        first = event == 0
+        solid = first & ended & si.is_valid()
+        alpha = dr.select(first & water, 1.0, alpha)
+        distance, hit = dr.select(solid, si.t, distance), dr.select(solid, 1.0, hit)
+        context, one, two = mi.BSDFContext(), sampler.next_1d(water), sampler.next_2d(water)
+        bs, value = bsdf.sample(context, si, one, two, water)
+        weight = dr.select(water, weight * value, weight)
+        ray = dr.select(water, si.spawn_ray(si.to_world(bs.wo)), ray)
+        return ray, water, event + 1, weight, colour, alpha, distance, hit, sampler
 
-        def aov_names(self) -> list[str]:
-            return ["alpha", "distance", "hit"]
+    start = (mi.Ray3f(ray), mi.Bool(True), mi.UInt32(0), mi.Color3f(1), mi.Color3f(0),
+             mi.Float(0), mi.Float(0), mi.Float(0), sampler)  # fmt: skip
+    end = dr.while_loop(start, more, follow, label="water")
+    return end[4], end[5], end[6], end[7]
 
-        def sample(
-            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
-        ) -> tuple[Any, Any, list[Any]]:
-            def more(ray: Any, going: Any, event: Any, *_: Any) -> Any:
-                return going & (event < MAX_EVENTS)
 
-            def follow(
-                ray: Any, going: Any, event: Any, weight: Any, colour: Any,
-                alpha: Any, distance: Any, hit: Any, sampler: Any,
-            ) -> tuple[Any, ...]:  # fmt: skip
-                si = scene.ray_intersect(ray, going)
-                bsdf = si.bsdf(ray)
-                water = going & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-                ended = going & ~water
-                colour = colour + dr.select(ended, weight * hit_radiance(scene, ray, si, ended), 0)
-                first = event == 0
-                solid = first & ended & si.is_valid()
-                alpha = dr.select(first & water, 1.0, alpha)
-                distance, hit = dr.select(solid, si.t, distance), dr.select(solid, 1.0, hit)
-                context, one, two = mi.BSDFContext(), sampler.next_1d(water), sampler.next_2d(water)
-                bs, value = bsdf.sample(context, si, one, two, water)
-                weight = dr.select(water, weight * value, weight)
-                ray = dr.select(water, si.spawn_ray(si.to_world(bs.wo)), ray)
-                return ray, water, event + 1, weight, colour, alpha, distance, hit, sampler
+def _pixel_means(scene: Any, camera: Camera, sensor: Any, spp: int, seed: int) -> Array:
+    """Means (H, W, 6) over each pixel's rays: radiance, alpha, distance, hit.
 
-            start = (mi.Ray3f(ray), mi.Bool(active), mi.UInt32(0), mi.Color3f(1), mi.Color3f(0),
-                     mi.Float(0), mi.Float(0), mi.Float(0), sampler)  # fmt: skip
-            end = dr.while_loop(start, more, follow, label="water")
-            return end[4], mi.Bool(True), [end[5], end[6], end[7]]
+    Every pixel's rays are summed in their order. Mitsuba's own film adds them as its threads
+    finish, so that the last bits of a picture would depend on the number of cores.
+    """
+    import drjit as dr
 
-    mi.register_integrator("baked_light", BakedLight)
-    return mi.load_dict({"type": "baked_light"})
+    mi = mitsuba()
+    size = camera.width * camera.height * spp
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(seed, size)
+    pixel = dr.arange(mi.UInt32, size) // spp
+    corner = mi.Point2f(pixel % camera.width, pixel // camera.width)
+    place = (corner + sampler.next_2d()) / mi.Point2f(camera.width, camera.height)
+    lens = sampler.next_2d() if camera.aperture_m > 0 else mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray(0.0, 0.5, place, lens)
+    colour, alpha, distance, hit = _trace(scene, ray, sampler)
+    dr.eval(colour, alpha, distance, hit)  # at once: each sum would trace the rays again
+    sums = [dr.block_sum(c, spp) for c in (*colour, alpha, distance, hit)]
+    means = np.stack([np.asarray(c) for c in sums], axis=-1) / np.float32(spp)
+    return means.reshape(camera.height, camera.width, 6)
 
 
 def bake_place(place: Place, *, rays: int = 128, bounces: int = 2) -> Baked:
@@ -131,7 +142,7 @@ def _water(drops: Sequence[drop_shape.Drop], from_pane: Array) -> Any:
     return out
 
 
-def _sensor(camera: Camera, world_from_cam: Array, spp: int) -> dict[str, Any]:
+def _sensor(camera: Camera, world_from_cam: Array) -> dict[str, Any]:
     mi = mitsuba()
     pose = np.eye(4)
     pose[:3, :3] = world_from_cam[:3, :3] @ np.diag([-1.0, -1.0, 1.0])  # Mitsuba: x left, y up
@@ -147,7 +158,6 @@ def _sensor(camera: Camera, world_from_cam: Array, spp: int) -> dict[str, Any]:
     return {
         **lens, "to_world": mi.ScalarTransform4f(pose), "fov": fov, "fov_axis": "x",
         "near_clip": 0.001 * SCALE, "far_clip": 1000 * SCALE, "film": film,
-        "sampler": {"type": "multijitter", "sample_count": spp},
     }  # fmt: skip
 
 
@@ -191,10 +201,8 @@ def render(
         around_camera[:3, 3] -= centre
         items["water"] = _water(drops, around_camera)
     scene = mi.load_dict({"type": "scene", "sky": sky_emitter(baked.place), **items})
-    sensor = mi.load_dict(_sensor(camera, world_from_cam.astype(np.float32), spp))
-    image = np.asarray(
-        mi.render(scene, sensor=sensor, integrator=_integrator(), spp=spp, seed=seed)
-    )
+    sensor = mi.load_dict(_sensor(camera, world_from_cam.astype(np.float32)))
+    image = _pixel_means(scene, camera, sensor, spp, seed)
     distance, hit = image[..., 4], image[..., 5]
     depth = np.where(hit > 0.5, distance / np.maximum(hit, 1e-6), 0) / SCALE * _cosines(camera)
     return Picture(

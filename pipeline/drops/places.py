@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pipeline.drops import places_room, places_street
@@ -110,7 +111,12 @@ def build(name: str, seed: int) -> Place:
     if name not in _PLACES:
         raise UserError(f"no place is called {name!r}", hint=f"use one of {', '.join(NAMES)}")
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    builder, light = _PLACES[name](rng)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # how cv2.resize rounds depends on the number of threads
+    try:
+        builder, light = _PLACES[name](rng)
+    finally:
+        cv2.setNumThreads(threads)
     sun = np.asarray(light["sun"], np.float32)
     return Place(
         name=name,
