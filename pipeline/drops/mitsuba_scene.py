@@ -95,8 +95,9 @@ def _pixel_means(scene: Any, camera: Camera, sensor: Any, spp: int, seed: int) -
     import drjit as dr
 
     mi = mitsuba()
-    size = camera.width * camera.height * spp
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    spp = sampler.sample_count()  # rounded up to a grid
+    size = camera.width * camera.height * spp
     sampler.set_samples_per_wavefront(spp)
     sampler.seed(seed, size)
     pixel = dr.arange(mi.UInt32, size) // spp

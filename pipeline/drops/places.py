@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipeline.drops import places_room, places_street
+from pipeline.drops import places_harbour, places_room, places_street
 from pipeline.drops.places_parts import Array, Builder, TexturedMesh
 from pipeline.drops.places_textures import noise
 from pipeline.errors import UserError
@@ -42,6 +42,7 @@ class Place:
     sun_direction: Array
     sun_irradiance: Array
     lamps: list[Lamp]
+    grey: float = 0.17  # to which an exposure meter brings the median: less where it is dark
 
 
 def sky_directions(height: int) -> Array:
@@ -96,9 +97,19 @@ def _room(rng: Rng) -> tuple[Builder, dict[str, object]]:
                "lamps": [Lamp(*lamp) for lamp in lamps]}  # fmt: skip
 
 
+def _harbour(rng: Rng) -> tuple[Builder, dict[str, object]]:
+    b, lamps = places_harbour.build(rng)
+    tone = rng.uniform(0.8, 1.2)
+    sky = clear_sky(rng, np.array([0.05, 0.09, 0.22]) * tone, np.array([0.62, 0.34, 0.22]) * tone,
+                    np.array([0.40, 0.26, 0.28]) * tone, cover=rng.uniform(0.3, 0.5))  # fmt: skip
+    return b, {"sky": sky, "sun": [0.3, -0.1, 1.0], "irradiance": np.zeros(3),
+               "lamps": [Lamp(*lamp) for lamp in lamps], "grey": 0.10}  # fmt: skip
+
+
 _PLACES: dict[str, Callable[[Rng], tuple[Builder, dict[str, object]]]] = {
     "street": _street,
     "room": _room,
+    "harbour": _harbour,
 }
 NAMES = tuple(_PLACES)
 
@@ -126,4 +137,5 @@ def build(name: str, seed: int) -> Place:
         sun_direction=sun / np.linalg.norm(sun),
         sun_irradiance=np.asarray(light["irradiance"], np.float32),
         lamps=list(light["lamps"]),  # type: ignore[call-overload]
+        grey=float(light.get("grey", 0.17)),  # type: ignore[arg-type]
     )

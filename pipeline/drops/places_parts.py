@@ -116,6 +116,20 @@ class Builder:
         uv = cell.apply(uv) if cell else uv * [la / tile, lb / tile] + np.asarray(shift)
         self.add(material, o + s * a + t * b, normal, uv, _grid_faces(nb, na), tint, glow)
 
+    def sheet(
+        self, material: str, points: Vec, *, tile: float = 1.0, tint: Vec = WHITE, glow: float = 0.0
+    ) -> None:
+        """Curved surface through points (R, C, 3): rows downwards, columns to the right.
+
+        tint: (3,) or (R * C, 3).
+        """
+        p = np.asarray(points, np.float32)
+        right, down = np.gradient(p, axis=1), np.gradient(p, axis=0)
+        run = [np.cumsum(np.linalg.norm(d, axis=2), axis=a) for d, a in ((right, 1), (down, 0))]
+        uv = np.stack(run, -1) / tile
+        normals = np.cross(down, right)
+        self.add(material, p, normals, uv, _grid_faces(*p.shape[:2]), tint, glow)
+
     def box(
         self, material: str, centre: Vec, size: Vec, *, yaw: float = 0.0, tile: float = 1.0,
         cell: Cell | None = None, tint: Vec = WHITE, glow: float = 0.0, step: float | None = None,

@@ -127,6 +127,16 @@ def ground(rng: Rng, colour: Sequence[float], *, size: int = 512) -> Array:
     return _shade(np.broadcast_to(linear(colour), (size, size, 3)), grains + stones)
 
 
+def ripples(rng: Rng, *, size: int = 512) -> Array:
+    """Still water with small waves: blue-grey troughs, crests that catch the sky."""
+    thin = noise(rng, size, 24, 4)[::4]
+    waves = cv2.resize(np.tile(thin, (4, 1))[:size], (size, size))
+    flat = cv2.resize(noise(rng, size, 10, 4)[:, ::4], (size, size), interpolation=cv2.INTER_LINEAR)
+    crest = np.clip(0.5 + 0.3 * flat + 0.12 * waves, 0, 1)[..., None]
+    colour = linear((0.20, 0.27, 0.33)) * (1 - crest) + linear((0.62, 0.62, 0.66)) * crest
+    return np.clip(colour, 0.01, 0.95).astype(np.float32)
+
+
 def _pane(rng: Rng, h: int, w: int) -> Array:
     """A window seen from the street: dark room, curtains, the sky and roofs reflected."""
     v, u = np.mgrid[0:h, 0:w].astype(np.float32)

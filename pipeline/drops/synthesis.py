@@ -22,12 +22,16 @@ REACH = (0.66, 0.42)  # how far cameras stray from the grid's centre, metres, wi
 
 @dataclass(frozen=True)
 class WetView:
-    """One view. rainy, clean (H, W, 3) and coverage (H, W) uint8; depth (H, W) metres, 0: sky."""
+    """One view. rainy, clean (H, W, 3) and coverage (H, W) uint8; depth (H, W) metres, 0: sky;
+
+    alpha (H, W) the coverage before it was rounded.
+    """
 
     rainy: Bytes
     clean: Bytes
     coverage: Bytes
     depth: npt.NDArray[np.float32]
+    alpha: npt.NDArray[np.float32]
 
 
 def focal_px(width: int, field_of_view_deg: float) -> float:
@@ -97,7 +101,7 @@ def cameras(camera: scene.Camera, poses: dict[str, Matrix]) -> dict[str, Any]:
 def place_exposure(baked: scene.Baked, camera: scene.Camera) -> float:
     """Exposure of the whole sequence, from a quick picture by the mean camera."""
     quick = scene.render(baked, camera, np.eye(4), spp=16, seed=0)
-    return scene.exposure(quick.radiance)
+    return scene.exposure(quick.radiance, grey=baked.place.grey)
 
 
 def to_bytes(picture: npt.NDArray[np.floating]) -> Bytes:
@@ -133,6 +137,7 @@ def wet_view(
         to_bytes(scene.develop(clean.radiance, exposure)),
         to_bytes(rainy.alpha),
         clean.depth,
+        rainy.alpha,
     )
 
 

@@ -171,7 +171,7 @@ def test_trajectory_is_a_grid_that_looks_ahead() -> None:
 RECIPE = {
     "mode": "paint", "place": "street", "source": "clean", "seed": 1, "views": 2, "width": 32,
     "height": 24, "field_of_view_deg": 62, "spp": 4, "clean_spp": 4, "coverage": 0.15,
-    "radius_mm": [3.0, 9.0], "pane_m": 0.12, "aperture_mm": 1.0, "depth": False,
+    "radius_mm": [3.0, 9.0], "pane_m": 0.12, "aperture_mm": 1.0, "maps": False,
 }  # fmt: skip
 
 
@@ -217,7 +217,7 @@ def test_stage_renders_resumes_and_repeats_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(places, "build", lambda name, seed: wall())
-    params = synthesize.Params(**RECIPE | {"mode": "lens", "depth": True})
+    params = synthesize.Params(**RECIPE | {"mode": "lens", "maps": True})
     real, calls = synthesis.wet_view, []
 
     def stopped(*args: object, **more: object) -> synthesis.WetView:

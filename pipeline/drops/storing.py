@@ -1,0 +1,85 @@
+"""One wet view made and stored with its truth: what runs per view, on this machine or on another."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pipeline.drops import mitsuba_scene, places, synthesis
+from pipeline.drops.shape import Drop
+from pipeline.io.atomic import write_bytes
+from pipeline.io.images import read_photo
+from pipeline.io.maps import write_depth, write_map
+
+Recipe = dict[str, Any]  # the section `synthesize`, as plain values
+COVERED = 0.02  # share of a pixel's rays that meet water, from which the true mask leaves it out
+
+
+def encode(path: Path, image: np.ndarray, quality: int | None = None) -> None:
+    """Writes a PNG, or with a quality a JPEG without chroma subsampling."""
+    stored = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+    options = [] if quality is None else [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling]
+    done, data = cv2.imencode(path.suffix, stored, options)
+    if not done:
+        raise OSError(f"{path}: the image could not be encoded")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, data.tobytes())
+
+
+def plan(recipe: Recipe) -> tuple[mitsuba_scene.Camera, list[synthesis.Matrix], list[Drop]]:
+    """Camera, poses (cam_from_world) and drops of a rendered scene."""
+    optics = ("width", "height", "field_of_view_deg", "aperture_mm")
+    camera = synthesis.camera_of(**{key: recipe[key] for key in optics})
+    pane = ("pane_m", "coverage", "radius_mm")
+    poses, drops = synthesis.scene_plan(
+        recipe["mode"], recipe["seed"], recipe["views"], camera, **{k: recipe[k] for k in pane}
+    )
+    return camera, poses, drops
+
+
+@lru_cache(maxsize=1)
+def _prepared(key: str) -> tuple[Any, ...]:
+    """Baked place, exposure and plan of a recipe, once per process."""
+    recipe = json.loads(key)
+    baked = mitsuba_scene.bake_place(places.build(recipe["place"], recipe["seed"]))
+    camera, poses, drops = plan(recipe)
+    return baked, synthesis.place_exposure(baked, camera), camera, poses, drops
+
+
+def render_view(recipe: Recipe, number: int, stem: str, work: Path) -> None:
+    """Renders view `number` into `work`; its photo comes last and says that the view is done."""
+    baked, exposure, camera, poses, drops = _prepared(json.dumps(recipe, sort_keys=True))
+    view = synthesis.wet_view(
+        baked, camera, poses[number], drops, exposure=exposure, spp=recipe["spp"],
+        clean_spp=recipe["clean_spp"], seed=recipe["seed"] * 10007 + number,
+        pane_m=recipe["pane_m"] if recipe["mode"] == "lens" else None,
+    )  # fmt: skip
+    encode(work / f"truth/clean/{stem}.jpg", view.clean, 98)
+    encode(work / f"truth/coverage/{stem}.png", view.coverage)
+    if recipe["maps"]:
+        for name, write, values in (
+            ("alpha", write_map, view.alpha),
+            ("depth", write_depth, view.depth),
+        ):
+            (work / "truth" / name).mkdir(parents=True, exist_ok=True)
+            write(work / f"truth/{name}/{stem}.exr", values)
+        keep_mask = np.where(view.alpha > COVERED, 0, 255).astype(np.uint8)
+        encode(work / f"truth/masks/{stem}.png", keep_mask)
+    encode(work / f"{stem}.jpg", view.rainy, 95)
+
+
+def paint_view(recipe: Recipe, path: Path, work: Path) -> None:
+    """Wets the photo at `path`; the same drops, in the sensor's frame, as on the others."""
+    longest = max(recipe["width"], recipe["height"])
+    clean = synthesis.shrunk(read_photo(path)[0], longest)
+    keys = ("seed", "pane_m", "coverage", "radius_mm", "aperture_mm", "field_of_view_deg")
+    rainy, coverage = synthesis.painted(clean, **{key: recipe[key] for key in keys})
+    encode(work / f"truth/clean/{path.stem}.jpg", clean, 98)
+    encode(work / f"truth/coverage/{path.stem}.png", coverage)
+    encode(work / f"{path.stem}.jpg", rainy, 95)
