@@ -2,10 +2,11 @@
 
     python -m benchmarks.scaling            # about two minutes
 
-Stages: each part of a step of the fast field timed by itself on one thread, beside the floor that
+All times are the processor's, on one thread, so that other work on the machine counts little.
+Stages: each part of a step of the fast field timed by itself, beside the floor that
 the machine sets for it: floating-point operations over the rate of a large matrix product measured
 here, or bytes moved over the bandwidth of a large copy measured here, whichever takes longer.
-Random reads of table rows count with whole cache lines.
+Random reads of table rows count with whole cache lines; tables that fit a cache can beat this floor.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ LINE = 64
 
 
 def best(work: Callable[[], Any], repeats: int = 7) -> float:
-    """Seconds of the fastest of a few runs."""
+    """Processor seconds of the fastest of a few runs."""
     times = []
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin = time.process_time()
         work()
-        times.append(time.perf_counter() - begin)
+        times.append(time.process_time() - begin)
     return min(times)
 
 
@@ -120,13 +121,13 @@ def cost(settings: dict[str, Any], views: int, width: int) -> None:
     train, test, model = photos_and_field("fast", settings, views, (width, height))
     buffer = RayBuffer(train, 0)
     fit(model, buffer, steps=5, batch_rays=settings["batch_rays"], seed=0, threads=1)
-    begin = time.perf_counter()
+    begin = time.process_time()
     fit(model, buffer, steps=30, batch_rays=settings["batch_rays"], seed=0, threads=1)
-    step = (time.perf_counter() - begin) / 30
-    photo, begin = test[0], time.perf_counter()
+    step = (time.process_time() - begin) / 30
+    photo, begin = test[0], time.process_time()
     size = (width, height)
     render_view(model, photo.cam_from_world, photo.intrinsics, size, NEAR, FAR)
-    view = time.perf_counter() - begin
+    view = time.process_time() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
         f"{views:6d} {width:5d}x{height:<5d} {1e3 * step:8.1f} {view:7.2f} {peak:8.0f}", flush=True
@@ -136,6 +137,7 @@ def cost(settings: dict[str, Any], views: int, width: int) -> None:
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--stages", action="store_true", help="the first table only")
     parser.add_argument("--row", type=int, nargs=2, metavar=("VIEWS", "WIDTH"), help="one row only")
     flags = parser.parse_args()
     settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
@@ -144,6 +146,8 @@ def main() -> None:
         cost(settings, *flags.row)
         return
     stages(settings)
+    if flags.stages:
+        return
     print(f"\n{'images':>6} {'size':11} {'ms/step':>8} {'s/view':>7} {'peak MB':>8}")
     for views, width in ((12, 400), (24, 400), (48, 400), (24, 200), (24, 800)):
         # A process of its own for every row: peak memory never falls within one.
