@@ -20,7 +20,7 @@ import filelock
 from tqdm import tqdm
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import disk_faults
+from pipeline.io.atomic import disk_fault, disk_faults
 from pipeline.io.paths import ScenePaths
 from pipeline.params import Section, read_section
 
@@ -140,21 +140,30 @@ def _run(
         with disk_faults(work):
             work.mkdir(parents=True, exist_ok=True)
             lock = filelock.FileLock(work / "lock", timeout=0).acquire()
-            _log_to(work / "log.txt", job.verbose)
-        with lock:
-            closing = main(job, params)
     except filelock.Timeout:
         raise UserError(
             f"stage {name} of scene {job.scene} is already running.",
             "Wait for it, or end it first.",
         ) from None
-    except Exception:
-        # The traceback belongs into the log as well: the terminal may be gone when someone asks.
-        log.error("stage %s failed", name, exc_info=True)
-        raise
+    with lock:
+        with disk_faults(work):
+            _log_to(work / "log.txt", job.verbose)
+        closing = _logged(name, lambda: main(job, params), work)
     if closing:
         log.info("%s: %s", name, closing)
     return 0
+
+
+def _logged(name: str, stage: Callable[[], str | None], work: Path) -> str | None:
+    """What the stage returns; its traceback goes into the log too: the terminal may be gone later."""
+    try:
+        return stage()
+    except Exception as error:
+        log.error("stage %s failed", name, exc_info=True)
+        fault = None if isinstance(error, UserError) else disk_fault(work)
+        if fault is None:
+            raise
+        raise fault from error
 
 
 def _parser(name: str) -> argparse.ArgumentParser:
@@ -187,12 +196,17 @@ def _params_file(wish: Path | None) -> Path:
     return wish.resolve()
 
 
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Nothing: a full disk is told once, by what needs it more."""
+
+
 def _log_to(path: Path, verbose: bool) -> None:
     root = logging.getLogger()
     root.setLevel(logging.DEBUG if verbose else logging.INFO)
     for noisy in ("PIL", "distributed", "asyncio", "filelock", "matplotlib", "torch"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    file = logging.FileHandler(path, mode="w", encoding="utf-8")
+    file = _LogFile(path, mode="w", encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     terminal = _AboveProgressBars(logging.DEBUG if verbose else logging.INFO)
     terminal.setFormatter(logging.Formatter("%(message)s"))

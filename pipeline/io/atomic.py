@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,25 @@ def _disk_error(error: OSError, path: Path) -> UserError | None:
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return UserError(f"{path}: cannot be written ({error.strerror}).", "Check its permissions.")
+    return None
+
+
+def disk_fault(folder: Path) -> UserError | None:
+    """The fault of a disk that takes nothing more into `folder`, found by trying; None when it does.
+
+    Libraries written in other languages tell a full disk in their own ways, or not at all.
+    """
+    probe = folder / f".probe.tmp-{os.getpid()}"
+    try:
+        with probe.open("wb") as file:
+            file.write(bytes(1 << 16))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return _disk_error(error, folder)
+    finally:
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)
     return None
 
 
@@ -56,6 +75,13 @@ def publish_dir(final: Path) -> Iterator[Path]:
         try:
             yield fresh
             _swap(fresh, final)
+        except UserError:
+            raise
+        except Exception as error:
+            fault = disk_fault(fresh)  # now: once the folder is gone, there is room again
+            if fault is None:
+                raise
+            raise fault from error
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
 
