@@ -234,7 +234,7 @@ def scores(counts: np.ndarray) -> list[Score]:
             f1=2 * hits / max(marked + wet, 1),
             iou=hits / max(marked + wet - hits, 1),
         )
-        for threshold, (hits, marked, wet) in zip(THRESHOLDS, counts.T, strict=True)
+        for threshold, (hits, marked, wet) in zip(THRESHOLDS, counts.T.tolist(), strict=True)
     ]
 
 

@@ -1,0 +1,122 @@
+"""The stage train_detector: weights and curve, the same when it was interrupted."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.attention import pools
+from pipeline.attention.weights import load_network
+from pipeline.io.images import write_image
+from pipeline.stage import Job
+from stages import train_detector
+from stages.train_detector import Params, PhaseParams, main
+
+PHASES = [PhaseParams(steps=1, iterations=n, batch=2, crop=32, rate=0.01) for n in (3, 1)]
+PARAMS = Params(
+    model="unet",
+    weights="w/unet.safetensors",
+    start="",
+    seed=5,
+    photos="photos",
+    painted=100,
+    rendered=["rendered"],
+    photo_pairs=["pairs"],
+    shares=(0.5, 0.5, 0.5),
+    clean_share=0.1,
+    validation=2,
+    validation_photos="",
+    validation_rendered=["rendered"],
+    validate_every=2,
+    bfloat16=False,
+    phases=PHASES,
+)
+
+
+def _disc(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    clean = rng.integers(60, 200, (48, 64, 3), dtype=np.uint8)
+    cover = np.zeros((48, 64), np.uint8)
+    cv2.circle(cover, (30, 20), 9, 255, -1)
+    return np.where(cover[..., None] > 0, 255 - clean, clean).astype(np.uint8), clean, cover
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folders of every kind of picture; painting makes four small ones instead of a hundred."""
+    rng = np.random.default_rng(1)
+    write_image(tmp_path / "photos/a.png", rng.integers(0, 256, (80, 90, 3), dtype=np.uint8))
+    for k in range(2):
+        wet, dry, cover = _disc(rng)
+        for kind, picture in (("rainy", wet), ("clean", dry), ("coverage", np.dstack([cover] * 3))):
+            write_image(tmp_path / f"rendered/{kind}/{k}.png", picture)
+        write_image(tmp_path / f"pairs/data/{k}_rain.png", wet)
+        write_image(tmp_path / f"pairs/gt/{k}_clean.png", dry)
+    monkeypatch.setattr(pools, "CHUNK", 4)
+    monkeypatch.setattr(pools, "SIZE", 48)
+    return tmp_path
+
+
+def _result(root: Path) -> tuple[bytes, str]:
+    weights = root / "w/unet.safetensors"
+    return weights.read_bytes(), weights.with_suffix(".csv").read_text()
+
+
+def test_weights_and_curve_and_the_same_after_an_interruption(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = Job(root, "made", None, "cpu", None, False)
+    fit = train_detector.fit
+
+    def stopped(trainer, *, on_score, **rest):
+        def once(*found):
+            on_score(*found)
+            raise KeyboardInterrupt
+
+        return fit(trainer, on_score=once, **rest)
+
+    monkeypatch.setattr(train_detector, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        main(job, PARAMS)
+    assert not (root / "w").exists()
+    monkeypatch.setattr(train_detector, "fit", fit)
+    main(job, PARAMS)
+    resumed = _result(root)
+    for checkpoint in job.paths.work("train_detector").glob("*.pt"):
+        checkpoint.unlink()
+    closing = main(job, PARAMS)
+    assert _result(root) == resumed
+
+    rows = list(csv.DictReader(resumed[1].splitlines()))
+    assert [(row["iteration"], row["set"]) for row in rows] == [
+        (done, name) for done in ("2", "3", "4") for name in ("rendered", "painted")
+    ]
+    assert (
+        closing
+        == f"unet.safetensors: best F1 {float(rows[-1]['f1'])} on painted pictures it was not trained on"
+    )
+    assert load_network(root / "w/unet.safetensors", "unet").reach() > 0
+
+
+def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:
+    photos = pools.list_pictures(root / "photos")
+    names = {
+        pools.painted_name(5, photos),
+        pools.painted_name(6, photos),
+        pools.painted_name(5, ()),
+    }
+    assert len(names) == 3
+    chunk = root / "0.npy"
+    pools.paint_chunk(chunk, 5, 0, photos)
+    written = chunk.read_bytes()
+    pools.paint_chunk(chunk, 6, 0, photos)
+    assert chunk.read_bytes() == written
+    rainy, clean, coverage = pools.read_chunk(chunk)
+    assert len(rainy) == 4 and rainy[0].shape == (48, 48, 3) and coverage[0].shape == (48, 48)
+    dry = [
+        np.abs(a.astype(int) - b)[c == 0] for a, b, c in zip(rainy, clean, coverage, strict=True)
+    ]
+    assert np.mean(np.concatenate(dry)) < 3  # compression alone tells them apart there
