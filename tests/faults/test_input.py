@@ -221,19 +221,19 @@ def test_one_mask_gone(whole: Workshop) -> None:
 def test_missing_weights(photos: Workshop) -> None:
     assert photos.run("ingest").code == 0
     shutil.rmtree(photos.root / "weights")
-    photos.refuses("attention", "weights/detector.safetensors do not exist")
+    photos.refuses("attention", "weights/unet.safetensors do not exist")
 
 
 @pytest.mark.parametrize("content", [b"", b"\x80\x04K\x01.", b"no weights at all, but text"])
 def test_damaged_weights(photos: Workshop, content: bytes) -> None:
     assert photos.run("ingest").code == 0
-    (photos.root / "weights/detector.safetensors").write_bytes(content)
-    photos.refuses("attention", "weights/detector.safetensors")
+    (photos.root / "weights/unet.safetensors").write_bytes(content)
+    photos.refuses("attention", "weights/unet.safetensors")
 
 
 def test_truncated_weights(photos: Workshop) -> None:
     assert photos.run("ingest").code == 0
-    file = photos.root / "weights/detector.safetensors"
+    file = photos.root / "weights/unet.safetensors"
     file.write_bytes(file.read_bytes()[:100_000])
     photos.refuses("attention", str(file))
 
