@@ -8,7 +8,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.masking.glass import Glass, GlassCamera, LensGlass, PaneGlass, gather, neighbours
+from pipeline.masking.glass import (
+    Glass,
+    GlassCamera,
+    LensGlass,
+    PaneGlass,
+    aligned,
+    gather,
+    neighbours,
+)
 from pipeline.masking.masks import automatic_threshold, dilate, threshold
 from pipeline.masking.remask import Redrawn, redraw
 from pipeline.masking.sweep import Found, find_glass
@@ -19,6 +27,7 @@ log = logging.getLogger(__name__)
 Look = Callable[[Sequence[np.ndarray], Found], Sequence[np.ndarray | None]]
 FEWEST_ON_PANE = 2
 SHARE_ON_LENS = 0.25
+OFF = 25  # the longer side over this: how far poses may put a view off on the pane
 SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
 
 
@@ -71,9 +80,10 @@ def repair(
     """
     found = _chosen(find_glass(attentions, cameras, farthest, at_least=agreement), mode)
     masks = list(drop_masks)
+    glass = _glass(found, cameras, attentions)
     if gather_attention and found.mode != "none":
         t = automatic_threshold(attentions)
-        masks = attention_on_glass(_glass(found, cameras), attentions, masks, t, window, dilation)
+        masks = attention_on_glass(glass, attentions, masks, t, window, dilation)
     done = [Round(masks, found, changed_share(drop_masks, masks), None)]
     while len(done) <= rounds:
         residuals = look(done[-1].drop_masks, found)
@@ -82,7 +92,7 @@ def repair(
             return Repaired(done, "what disagrees with the scene does not stay on any glass")
         fitted = sum(values is not None for values in residuals)
         redrawn = redraw_views(
-            _glass(found, cameras),
+            _glass(found, cameras, attentions if use_attention else residuals),
             residuals,
             done[-1].drop_masks,
             quantile=quantile,
@@ -143,9 +153,14 @@ def _chosen(found: Found, mode: Literal["auto", "lens", "pane"]) -> Found:
     return found._replace(mode=mode)
 
 
-def _glass(found: Found, cameras: Sequence[GlassCamera]) -> Glass:
+def _glass(
+    found: Found, cameras: Sequence[GlassCamera], maps: Sequence[np.ndarray | None]
+) -> Glass:
+    """The glass that was found; on a pane the views are brought to cover by their `maps`."""
     if found.mode == "pane" and found.pane_from_world is not None:
-        return PaneGlass(found.pane_from_world, cameras)
+        glass = PaneGlass(found.pane_from_world, cameras)
+        glass.offsets = aligned(glass, maps, max(cameras[0].width, cameras[0].height) / OFF)
+        return glass
     return LensGlass(cameras[0].height, cameras[0].width)
 
 
