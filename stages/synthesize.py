@@ -34,7 +34,12 @@ class Params(Section):
     field_of_view_deg: Annotated[float, Field(gt=5, lt=150)]
     spp: Annotated[int, Field(ge=1)]
     clean_spp: Annotated[int, Field(ge=1)]
-    coverage: Annotated[float, Field(gt=0, lt=0.7)]
+    coverage: Annotated[float, Field(ge=0, lt=0.7)]
+    drift_mm: Annotated[float, Field(ge=0, le=20)]
+    stains: dict[
+        Literal["dust", "dirt", "smears", "scratches", "snow"],
+        Annotated[float, Field(ge=0, lt=0.7)],
+    ]
     radius_mm: tuple[PositiveFloat, PositiveFloat]
     pane_m: Annotated[float, Field(ge=0.03, le=2)]
     aperture_mm: Annotated[float, Field(ge=0, le=20)]
@@ -64,7 +69,7 @@ def _painted(job: Job, params: Params, work: Path) -> None:
     """Wets the photos of a folder, the same drops in the sensor's frame of each."""
     recipe = params.model_dump(mode="json")
     photos = list_photos(job.resolve(params.source), 1).values()
-    items = {path.stem: (recipe, path, work) for path in photos}
+    items = {path.stem: (recipe, k, path, work) for k, path in enumerate(photos)}
     map_named(storing.paint_view, items, job_label="painting", scheduler=job.scheduler)
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from pipeline.drops import mitsuba_scene, places, synthesis
+from pipeline.drops.creep import crept
 from pipeline.drops.shape import Drop
 from pipeline.io.atomic import write_bytes
 from pipeline.io.images import read_photo
@@ -49,14 +50,19 @@ def _prepared(key: str) -> tuple[Any, ...]:
     recipe = json.loads(key)
     baked = mitsuba_scene.bake_place(places.build(recipe["place"], recipe["seed"]))
     camera, poses, drops = plan(recipe)
-    return baked, synthesis.place_exposure(baked, camera), camera, poses, drops
+    fixed = recipe["mode"] == "scene"
+    pane_m = synthesis.SCENE_PANE_M if fixed else recipe["pane_m"]
+    stains = synthesis.pane_stains(recipe["seed"], camera, recipe["stains"], pane_m, fixed=fixed)
+    return baked, synthesis.place_exposure(baked, camera), camera, poses, drops, stains
 
 
 def render_view(recipe: Recipe, number: int, stem: str, work: Path) -> None:
     """Renders view `number` into `work`; its photo comes last and says that the view is done."""
-    baked, exposure, camera, poses, drops = _prepared(json.dumps(recipe, sort_keys=True))
+    baked, exposure, camera, poses, drops, stains = _prepared(json.dumps(recipe, sort_keys=True))
+    if recipe["mode"] == "lens":
+        drops = crept(drops, number * recipe["drift_mm"] / 1000)
     view = synthesis.wet_view(
-        baked, camera, poses[number], drops, exposure=exposure, spp=recipe["spp"],
+        baked, camera, poses[number], drops, stains=stains, exposure=exposure, spp=recipe["spp"],
         clean_spp=recipe["clean_spp"], seed=recipe["seed"] * 10007 + number,
         pane_m=recipe["pane_m"] if recipe["mode"] == "lens" else None,
     )  # fmt: skip
@@ -74,12 +80,13 @@ def render_view(recipe: Recipe, number: int, stem: str, work: Path) -> None:
     encode(work / f"{stem}.jpg", view.rainy, 95)
 
 
-def paint_view(recipe: Recipe, path: Path, work: Path) -> None:
-    """Wets the photo at `path`; the same drops, in the sensor's frame, as on the others."""
+def paint_view(recipe: Recipe, number: int, path: Path, work: Path) -> None:
+    """Wets the photo at `path`; photo `number` of its folder. The others get the same drops."""
     longest = max(recipe["width"], recipe["height"])
     clean = synthesis.shrunk(read_photo(path)[0], longest)
-    keys = ("seed", "pane_m", "coverage", "radius_mm", "aperture_mm", "field_of_view_deg")
-    rainy, coverage = synthesis.painted(clean, **{key: recipe[key] for key in keys})
+    keys = ("seed", "pane_m", "coverage", "radius_mm", "aperture_mm", "field_of_view_deg", "stains")
+    creep_m = number * recipe["drift_mm"] / 1000
+    rainy, coverage = synthesis.painted(clean, creep_m=creep_m, **{k: recipe[k] for k in keys})
     encode(work / f"truth/clean/{path.stem}.jpg", clean, 98)
     encode(work / f"truth/coverage/{path.stem}.png", coverage)
     encode(work / f"{path.stem}.jpg", rainy, 95)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +11,25 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.drops import mitsuba_scene as scene
+from pipeline.drops.creep import crept
+from pipeline.drops.optics import blur_diameter_px, linear_to_srgb, srgb_to_linear
 from pipeline.drops.painter import paint
 from pipeline.drops.shape import Drop, sample_drops
+from pipeline.drops.stains import over, sample_stains, seen_layer, stained
 
 Bytes = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
 SCENE_PANE_M = 0.45  # from the mean camera to a pane that stays in the scene
+LENS_PANE_M = 0.12
 REACH = (0.66, 0.42)  # how far cameras stray from the grid's centre, metres, with their jitter
+
+
+@dataclass(frozen=True)
+class Stains:
+    """A premultiplied layer (H, W, 4) on the pane, its origin at the centre, and its pixels' size."""
+
+    layer: npt.NDArray[np.float32]
+    pitch_m: float
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,44 @@ def cameras(camera: scene.Camera, poses: dict[str, Matrix]) -> dict[str, Any]:
     return {"frames": frames, "unit": "m", **inside}
 
 
+def pane_stains(
+    seed: int,
+    camera: scene.Camera,
+    kinds: Mapping[str, float],
+    pane_m: float,
+    *,
+    fixed: bool = False,
+) -> Stains | None:
+    """What else sits on the pane, by kind and share covered; None for nothing. Sizes are those of
+
+    a pane on the lens (0.12 m) and grow with the distance. fixed: a pane that stays in the scene.
+    """
+    if not any(kinds.values()):
+        return None
+    pitch = pane_m / camera.focal_px
+    half = np.array([camera.width, camera.height]) / 2 * pitch * 1.05 + camera.aperture_m
+    if fixed:
+        half = (half + REACH) * 1.08
+    shape = (round(2 * half[1] / pitch), round(2 * half[0] / pitch))
+    layer = np.zeros((*shape, 4), np.float32)
+    rng = np.random.default_rng([seed, 4])
+    per_mm = camera.focal_px / LENS_PANE_M / 1000
+    for kind, share in sorted(kinds.items()):
+        layer = over(sample_stains(rng, kind, shape, share, per_mm), layer)
+    return Stains(layer, pitch)
+
+
+def stains_seen(
+    stains: Stains, camera: scene.Camera, cam_from_pane: Matrix
+) -> npt.NDArray[np.float32]:
+    """The stains' layer (H, W, 4) in one camera; cam_from_pane (4, 4), metres."""
+    f, w, h = camera.focal_px, camera.width, camera.height
+    k = np.array([[f, 0, w / 2], [0, f, h / 2], [0, 0, 1]])
+    pixel_from_pane = k @ cam_from_pane[:3][:, [0, 1, 3]]
+    blur = blur_diameter_px(f, camera.aperture_m, float(cam_from_pane[2, 3]), camera.focus_m)
+    return seen_layer(stains.layer, stains.pitch_m, pixel_from_pane, (h, w), blur)
+
+
 def place_exposure(baked: scene.Baked, camera: scene.Camera) -> float:
     """Exposure of the whole sequence, from a quick picture by the mean camera."""
     quick = scene.render(baked, camera, np.eye(4), spp=16, seed=0)
@@ -120,6 +170,7 @@ def wet_view(
     clean_spp: int,
     seed: int,
     pane_m: float | None,
+    stains: Stains | None = None,
 ) -> WetView:
     """One view through `drops` and without them; pane_m None: the pane stays in the scene."""
     fixed = None
@@ -130,14 +181,22 @@ def wet_view(
         baked, camera, cam_from_world, spp=spp, seed=2 * seed, drops=drops,
         world_from_pane=fixed, pane_m=pane_m or SCENE_PANE_M,
     )  # fmt: skip
+    radiance, alpha = rainy.radiance, rainy.alpha
+    if stains is not None:
+        cam_from_pane = cam_from_world @ fixed if fixed is not None else np.eye(4)
+        if fixed is None:
+            cam_from_pane[2, 3] = pane_m
+        layer = stains_seen(stains, camera, cam_from_pane)
+        radiance = stained(radiance, layer)
+        alpha = 1 - (1 - alpha) * (1 - layer[..., 3])
     # Other random numbers than the rainy picture's, so that their noise is not the same.
     clean = scene.render(baked, camera, cam_from_world, spp=clean_spp, seed=2 * seed + 1)
     return WetView(
-        to_bytes(scene.develop(rainy.radiance, exposure)),
+        to_bytes(scene.develop(radiance, exposure)),
         to_bytes(scene.develop(clean.radiance, exposure)),
-        to_bytes(rainy.alpha),
+        to_bytes(alpha),
         clean.depth,
-        rainy.alpha,
+        alpha,
     )
 
 
@@ -160,18 +219,28 @@ def painted(
     aperture_mm: float,
     field_of_view_deg: float,
     focal: float | None = None,
+    creep_m: float = 0.0,
+    stains: Mapping[str, float] | None = None,
 ) -> tuple[Bytes, Bytes]:
     """A photo (H, W, 3) wetted by the painter, and its coverage (H, W); both uint8.
 
     focal: pixels, if known, else from the field of view of the longer side. The drops follow from
-    the seed and the photo's shape alone: the same for all photos of one camera.
+    the seed and the photo's shape alone: the same for all photos of one camera, but for the creep (of
+    the largest drop, metres). stains: share covered by kind.
     """
     height, width = photo.shape[:2]
     focal = focal or focal_px(max(width, height), field_of_view_deg)
     camera = scene.Camera(width, height, focal, aperture_mm / 1000)
     drops = lens_drops(np.random.default_rng([seed, 2]), camera, pane_m, coverage, radius_mm)
     rainy, alpha = paint(
-        photo.astype(np.float32) / np.float32(255), drops, focal_px=focal, pane_distance=pane_m,
+        photo.astype(np.float32) / np.float32(255), crept(drops, creep_m), focal_px=focal, pane_distance=pane_m,
         aperture_radius=camera.aperture_m, focus_distance=camera.focus_m,
     )  # fmt: skip
+    spots = pane_stains(seed, camera, stains or {}, pane_m)
+    if spots is not None:
+        pane = np.eye(4)
+        pane[2, 3] = pane_m
+        layer = stains_seen(spots, camera, pane)
+        rainy = linear_to_srgb(stained(srgb_to_linear(rainy), layer))
+        alpha = 1 - (1 - alpha) * (1 - layer[..., 3])
     return to_bytes(rainy), to_bytes(alpha)
