@@ -83,6 +83,10 @@ _KINDS: dict[str, tuple[Draw, tuple[float, float, float], float]] = {
 NAMES = tuple(_KINDS)
 
 
+def _soft(opacity: Image, sigma: float) -> Image:
+    return cv2.GaussianBlur(opacity, (0, 0), sigma) if sigma > 0.3 else opacity
+
+
 def sample_stains(
     rng: Rng, kind: str, shape: tuple[int, int], coverage: float, pixels_per_mm: float
 ) -> Image:
@@ -93,13 +97,13 @@ def sample_stains(
     if kind not in _KINDS:
         raise UserError(f"no stain is called {kind!r}", hint=f"use one of {', '.join(NAMES)}")
     draw, colour, soft = _KINDS[kind]
-    opacity = np.zeros(shape, np.float32)
+    sharp = opacity = np.zeros(shape, np.float32)
     for number in range(200_000):
-        if (number < 64 or number % 8 == 0) and (opacity > VISIBLE).mean() >= coverage:
-            break
-        draw(rng, opacity, pixels_per_mm)
-    if soft * pixels_per_mm > 0.3:
-        opacity = cv2.GaussianBlur(opacity, (0, 0), soft * pixels_per_mm)
+        if number < 64 or number % 8 == 0:  # measured as it will be seen, with soft rims
+            opacity = _soft(sharp, soft * pixels_per_mm)
+            if (opacity > VISIBLE).mean() >= coverage:
+                break
+        draw(rng, sharp, pixels_per_mm)
     return np.dstack([opacity[..., None] * np.asarray(colour, np.float32), opacity])
 
 
