@@ -36,7 +36,9 @@ def test_layer_seen_from_the_front_is_the_layer_and_moves_with_the_pane() -> Non
     seen = seen_layer(layer, 0.002, front, (40, 60), 0.0)
     np.testing.assert_allclose(seen[11:19, 31:43], 0.5, atol=1e-6)
     assert seen[..., 3].sum() == pytest.approx(layer[..., 3].sum(), rel=1e-3)
-    right = seen_layer(layer, 0.002, [*front, [0, 0, 4], [0, 0, 0], [0, 0, 0]], (40, 60), 0.0)
+    moved = front.copy()
+    moved[0, 2] += 4
+    right = seen_layer(layer, 0.002, moved, (40, 60), 0.0)
     np.testing.assert_allclose(right[:, 4:], seen[:, :-4], atol=1e-5)
     blurred = seen_layer(layer, 0.002, front, (40, 60), 5.0)
     assert blurred[..., 3].sum() == pytest.approx(layer[..., 3].sum(), rel=0.01)
