@@ -58,7 +58,7 @@ def make(out: Path, seeds: range, views: int, spp: int, shared: bool) -> None:
         names = [f"{index * views + k:03d}.png" for k in range(views)]
         if all((out / "rainy" / name).exists() for name in names):
             continue
-        place = places.build(places.NAMES[seed % len(places.NAMES)], seed)
+        place = places.build(("street", "room")[seed % 2], seed)
         baked = mitsuba_scene.bake_place(place, rays=96)
         rng = np.random.default_rng([seed, 3])
         poses = mitsuba_scene.trajectory(rng, views, turn_deg=5.0)
