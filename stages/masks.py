@@ -14,7 +14,7 @@ from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.given_masks import pass_on_masks
 from pipeline.io.maps import read_map
 from pipeline.io.masks import write_keep_mask
-from pipeline.io.scene import GIVEN_MASKS, ImageRecord, read_images_json
+from pipeline.io.scene import GIVEN_MASKS, read_images_json
 from pipeline.masking import masks as masking
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
@@ -40,23 +40,15 @@ def main(job: Job, params: Params) -> str:
     if params.use_given and (job.paths.images / GIVEN_MASKS).is_dir():
         share = pass_on_masks(job.paths.images, records, job.paths.masks)
         return f"{100 * share:.1f} % of the pixels masked, by the masks that came with the photos"
-    maps = {record.name: _read_attention(job, record) for record in records}
-    t, chosen = _threshold(list(maps.values()), params)
-    mean = masking.temporal_mean(maps.values())
-    fixed, why = _lens_fixed(list(maps.values()), t, params)
+    files = {record.name: job.paths.attention / f"{record.stem}.exr" for record in records}
+    maps = [read_map(files[record.name], size=record.size) for record in records]
+    t, chosen = masking.chosen_threshold(maps, params.threshold)
+    fixed, why = masking.on_the_lens(maps, t, params.temporal_mean, params.lens_fixed_from)
+    mean = masking.temporal_mean(maps) if fixed else None
     with publish_dir(job.paths.masks) as fresh:
         coverage = map_named(
             write_mask,
-            {
-                record.name: (
-                    _path(job, record),
-                    mean if fixed else None,
-                    t,
-                    fresh / record.name,
-                    params,
-                )
-                for record in records
-            },
+            {name: (path, mean, t, fresh / name, params) for name, path in files.items()},
             job_label="masks",
             scheduler=job.scheduler,
         )
@@ -99,38 +91,6 @@ def write_mask(
     drop_mask = masking.dilate(masking.without_specks(drop_mask, params.min_area), params.dilation)
     write_keep_mask(path, ~drop_mask)
     return float(drop_mask.mean())
-
-
-def _path(job: Job, record: ImageRecord) -> Path:
-    return job.paths.attention / f"{record.stem}.exr"
-
-
-def _read_attention(job: Job, record: ImageRecord) -> np.ndarray:
-    path = _path(job, record)
-    attention = read_map(path)
-    if attention.shape != (record.height, record.width):
-        raise UserError(
-            f"{path} is {attention.shape[1]}x{attention.shape[0]}, its image {record.width}x{record.height}.",
-            "Run `python -m stages.attention` again.",
-        )
-    return attention
-
-
-def _threshold(attentions: list[np.ndarray], params: Params) -> tuple[float, str]:
-    if params.threshold != "auto":
-        return params.threshold, "masks.threshold"
-    return masking.automatic_threshold(attentions), "auto: where the maps' values part best"
-
-
-def _lens_fixed(attentions: list[np.ndarray], t: float, params: Params) -> tuple[bool, str]:
-    if params.temporal_mean != "auto":
-        return params.temporal_mean == "on", f"masks.temporal_mean is {params.temporal_mean}"
-    agreement = masking.lens_fixedness(attentions, t)
-    sign = ">=" if agreement >= params.lens_fixed_from else "<"
-    return (
-        agreement >= params.lens_fixed_from,
-        f"the maps agree to {agreement:.2f} {sign} {params.lens_fixed_from:g} per pixel",
-    )
 
 
 if __name__ == "__main__":

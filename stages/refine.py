@@ -58,15 +58,15 @@ def main(job: Job, params: Params) -> str:
             write_json(fresh / "refine.json", {"mode": "none", "why": why, "rounds": {}})
         return f"the masks stay as they are: {why}"
     masks = paths.masks if params.start != "none" else None
-    images = read_posed_images(
-        paths.images, masks, read_transforms(paths.poses / "transforms.json")
-    )
+    views = read_transforms(paths.poses / "transforms.json")
+    images = read_posed_images(paths.images, masks, views)
+    records = [image.record for image in images]
     field = GrowingField(images, params.far_factor, params.seed, job.device)
     with publish_dir(paths.refine) as fresh:
         copy_keep_masks(paths.masks, fresh)
         done = repair(
             lambda drop_masks, found: _look(job, params, field, drop_masks, fresh / "rounds"),
-            [read_map(paths.attention / f"{image.record.stem}.exr") for image in images],
+            [read_map(paths.attention / f"{r.stem}.exr", size=r.size) for r in records],
             [_camera(image) for image in images],
             [~image.keep_mask for image in images],
             BEYOND * field.near,
@@ -74,7 +74,7 @@ def main(job: Job, params: Params) -> str:
             gather_attention=params.start == "gathered",
             **params.model_dump(include=REPAIR),
         )
-        names = [image.record.name for image in images]
+        names = [record.name for record in records]
         for number, one in enumerate(done.rounds):
             write_drop_masks(fresh / f"rounds/{number}/masks", names, one.drop_masks)
             if one.redrawn is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import subprocess
 import sys
@@ -74,9 +75,55 @@ def test_imports_run_one_way() -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_library_files_stay_small() -> None:
-    lines = {path: path.read_text().count("\n") for path in ROOT.glob("pipeline/**/*.py")}
-    assert not {str(path.relative_to(ROOT)) for path, count in lines.items() if count > 400}
+# Longer than the rest, and not to grow in number: a file leaves this list when it is shortened.
+LONG_FILES = {
+    "stages/evaluate.py",
+    "stages/export.py",
+    "stages/ingest.py",
+    "stages/poses.py",
+    "stages/train_detector.py",
+}
+LONG_FUNCTIONS = {
+    "pipeline/drops/painter.py:scatter",
+    "pipeline/drops/places_room.py:shelf",
+    "pipeline/drops/places_room.py:shell",
+    "pipeline/drops/places_room.py:build",
+    "pipeline/drops/places_street.py:window",
+    "pipeline/drops/places_street.py:house",
+    "pipeline/drops/places_street.py:build",
+    "pipeline/drops/places_things.py:stall",
+    "pipeline/masking/loop.py:repair",
+    "pipeline/sfm/given.py:triangulate",
+    "stages/report.py:main",
+}
+
+
+def _sources() -> dict[str, str]:
+    """The text of every file of pipeline/ and stages/, by its path."""
+    paths = [*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/*.py")]
+    return {path.relative_to(ROOT).as_posix(): path.read_text() for path in sorted(paths)}
+
+
+def test_files_stay_small() -> None:
+    """Stages only read, call and write: 120 lines are enough; a library file has at most 400."""
+    ceiling = {"stages": 120, "pipeline": 400}
+    long = {
+        path for path, text in _sources().items() if text.count("\n") > ceiling[path.split("/")[0]]
+    }
+    assert long <= LONG_FILES
+
+
+def test_functions_stay_short() -> None:
+    """At most 50 lines, not counting what the docstring says."""
+    long = set()
+    for path, text in _sources().items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                first = node.body[0]
+                told = first.end_lineno - first.lineno + 1 if ast.get_docstring(node) else 0
+                if node.end_lineno - node.lineno + 1 - told > 50:
+                    long.add(f"{path}:{node.name}")
+    assert long <= LONG_FUNCTIONS
 
 
 def test_png_can_be_written_after_the_sfm_library_is_loaded() -> None:

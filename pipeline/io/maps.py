@@ -62,9 +62,20 @@ def write_map(
     _write(path, values, "Y", "half", attributes or {})
 
 
-def read_map(path: Path, made_by: str = "attention") -> np.ndarray:
-    """An (H, W) float32 map; UserError when the file is missing, damaged or not finite."""
-    return _read(path, made_by)
+def read_map(
+    path: Path, made_by: str = "attention", size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """An (H, W) float32 map; UserError when the file is missing, damaged, or not finite.
+
+    So it is when the map is not of `size` (width, height), its image's.
+    """
+    values = _read(path, made_by)
+    if size is not None and values.shape[::-1] != size:
+        raise UserError(
+            f"{path} is {values.shape[1]}x{values.shape[0]}, its image {size[0]}x{size[1]}.",
+            f"Run `python -m stages.{made_by}` again.",
+        )
+    return values
 
 
 def write_depth(path: Path, depth: np.ndarray) -> None:

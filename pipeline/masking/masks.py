@@ -115,3 +115,27 @@ def lens_fixedness(attentions: Sequence[np.ndarray], t: float) -> float:
     # sum over pixels of ordered pairs of views in which both mark it / ordered pairs in which the first does
     agreement = float((votes * (votes - 1)).sum() / (votes.sum() * (count - 1)))
     return float((agreement - density) / (1.0 - density))
+
+
+def chosen_threshold(attentions: Sequence[np.ndarray], wish: float | str) -> tuple[float, str]:
+    """The threshold t, and where it comes from: `wish`, or with "auto" `automatic_threshold`."""
+    if isinstance(wish, str):
+        return automatic_threshold(attentions), "auto: where the maps' values part best"
+    return wish, "masks.threshold"
+
+
+def on_the_lens(
+    attentions: Sequence[np.ndarray], t: float, wish: str, agree_from: float
+) -> tuple[bool, str]:
+    """Whether equation 5 holds, and why: `wish` is "on", "off", or "auto".
+
+    auto: drops are on the lens when `lens_fixedness` at t is at least `agree_from`.
+    """
+    if wish != "auto":
+        return wish == "on", f"masks.temporal_mean is {wish}"
+    agreement = lens_fixedness(attentions, t)
+    sign = ">=" if agreement >= agree_from else "<"
+    return (
+        agreement >= agree_from,
+        f"the maps agree to {agreement:.2f} {sign} {agree_from:g} per pixel",
+    )
