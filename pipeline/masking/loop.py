@@ -20,6 +20,7 @@ from pipeline.masking.glass import (
 from pipeline.masking.masks import automatic_threshold, dilate, threshold
 from pipeline.masking.remask import Redrawn, redraw
 from pipeline.masking.sweep import Found, find_glass
+from pipeline.masking.sweep import agreement as agreement_of
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +28,7 @@ log = logging.getLogger(__name__)
 Look = Callable[[Sequence[np.ndarray], Found], Sequence[np.ndarray | None]]
 FEWEST_ON_PANE = 2
 SHARE_ON_LENS = 0.25
+STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains more than it blurs
 OFF = 25  # the longer side over this: how far poses may put a view off on the pane
 SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
 
@@ -81,6 +83,11 @@ def repair(
     found = _chosen(find_glass(attentions, cameras, farthest, at_least=agreement), mode)
     masks = list(drop_masks)
     glass = _glass(found, cameras, attentions)
+    if use_attention and isinstance(glass, PaneGlass):
+        stack = np.stack([glass.from_view(view, seen) for view, seen in enumerate(attentions)])
+        if (steady := agreement_of(stack)) < STEADY:
+            why = f"the views do not cover each other well enough on the pane ({steady:.2f})"
+            return Repaired([Round(masks, found, 0.0, None)], why)
     if gather_attention and found.mode != "none":
         t = automatic_threshold(attentions)
         masks = attention_on_glass(glass, attentions, masks, t, window, dilation)

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.masking.glass import GlassCamera, pane_before
+from pipeline.masking.loop import repair
+from tests.masking.pane_scene import cameras, wetness
+
+
+def _look_at(wet: list[np.ndarray]):  # type: ignore[no-untyped-def]
+    """A scene that disagrees with the photos exactly where they are wet."""
+    rng = np.random.default_rng(0)
+
+    def look(drop_masks: Sequence[np.ndarray], found: object) -> list[np.ndarray | None]:
+        residuals: list[np.ndarray | None] = [
+            np.where(one > 0.5, 0.1, rng.uniform(0.008, 0.012, one.shape)).astype(np.float32)
+            for one in wet
+        ]
+        residuals[0] = None
+        return residuals
+
+    return look
+
+
+def _iou(drop_masks: Sequence[np.ndarray], wet: list[np.ndarray]) -> float:
+    pairs = [(mask, one > 0.5) for mask, one in zip(drop_masks, wet, strict=True)]
+    return sum((a & b).sum() for a, b in pairs) / sum((a | b).sum() for a, b in pairs)
+
+
+def _views() -> tuple[list[GlassCamera], np.ndarray]:
+    views = cameras(10)
+    return views, pane_before(np.stack([view.cam_from_world for view in views]), 1.5)
+
+
+def test_drops_on_a_pane_are_found_from_what_the_scene_says() -> None:
+    views, pane = _views()
+    wet = [wetness(pane, view) for view in views]
+    rng = np.random.default_rng(1)
+    maps = [np.where(rng.random(one.shape) < 0.1, rng.random(one.shape), one) for one in wet]
+    drawn = [seen > 0.3 for seen in maps]
+    done = repair(_look_at(wet), maps, views, drawn, 4.0, rounds=2)
+    assert done.rounds[-1].found.mode == "pane"
+    assert len(done.rounds) > 1
+    assert _iou(done.rounds[-1].drop_masks, wet) > max(0.8, _iou(drawn, wet))
+
+
+def test_drops_on_the_lens_and_no_drops() -> None:
+    views, pane = _views()
+    views = views[:6]
+    wet = [wetness(pane, views[0])] * len(views)
+    done = repair(_look_at(wet), wet, views, [one > 2 for one in wet], 4.0, rounds=3)
+    assert done.rounds[-1].found.mode == "lens"
+    assert done.ended == "the masks have settled"
+    assert _iou(done.rounds[-1].drop_masks, wet) > 0.95
+
+    dry = [np.zeros(one.shape, np.float32) for one in wet]
+    drawn = [np.zeros(one.shape, bool) for one in wet]
+    drawn[3][10:20, 10:20] = True
+    rng = np.random.default_rng(2)
+    noise = [rng.random(one.shape).astype(np.float32) * 0.1 for one in dry]
+    done = repair(_look_at(dry), noise, views, drawn, 4.0, rounds=3)
+    assert len(done.rounds) == 1
+    assert all(np.array_equal(a, b) for a, b in zip(done.rounds[-1].drop_masks, drawn, strict=True))
