@@ -28,7 +28,9 @@ log = logging.getLogger(__name__)
 Look = Callable[[Sequence[np.ndarray], Found], Sequence[np.ndarray | None]]
 FEWEST_ON_PANE = 2
 SHARE_ON_LENS = 0.25
+MEANS = 0.6  # of the threshold of single maps: a mean seldom reaches their heights
 STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains more than it blurs
+CLEAR = 0.5  # agreement of the residual on a pane from which it tells more than the attention did
 OFF = 25  # the longer side over this: how far poses may put a view off on the pane
 SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
 
@@ -89,7 +91,7 @@ def repair(
             why = f"the views do not cover each other well enough on the pane ({steady:.2f})"
             return Repaired([Round(masks, found, 0.0, None)], why)
     if gather_attention and found.mode != "none":
-        t = automatic_threshold(attentions)
+        t = MEANS * automatic_threshold(attentions)
         masks = attention_on_glass(glass, attentions, masks, t, window, dilation)
     done = [Round(masks, found, changed_share(drop_masks, masks), None)]
     while len(done) <= rounds:
@@ -97,6 +99,11 @@ def repair(
         found = _look_again(residuals, cameras, farthest, agreement, found, mode)
         if found.mode == "none":
             return Repaired(done, "what disagrees with the scene does not stay on any glass")
+        if use_attention and found.mode == "pane" and found.pane_agreement < CLEAR:
+            why = (
+                f"the residual does not agree well enough on the pane ({found.pane_agreement:.2f})"
+            )
+            return Repaired(done, why)
         fitted = sum(values is not None for values in residuals)
         redrawn = redraw_views(
             _glass(found, cameras, attentions if use_attention else residuals),

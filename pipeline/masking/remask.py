@@ -14,7 +14,7 @@ FLOOR = 1e-3  # residuals below it are equal: 8-bit photos hold no less
 LARGEST_HOLE = 0.25  # of the drop around it
 SUREST = 0.02  # attention is never taken for more certain than this
 ATTENTION_WEIGHT = 0.3  # of its log-odds against the log of the residual
-JOIN = 0.4  # between the clear median (0) and Otsu's threshold (1)
+JOIN = 0.5  # between the clear median (0) and Otsu's threshold (1)
 
 
 class Redrawn(NamedTuple):
