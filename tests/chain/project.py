@@ -133,6 +133,13 @@ def dvc(root: Path, *arguments: str, cores: set[int] | None = None) -> str:
     return _run(root, command, cores)
 
 
+def start_dvc(root: Path, *arguments: str) -> subprocess.Popen[bytes]:
+    """A `dvc` that is running."""
+    command = [Path(sys.executable).with_name("dvc"), *arguments]
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, cwd=root, env=environment(root), stdout=quiet, stderr=quiet)
+
+
 def by_hand(root: Path, command: str, cores: set[int] | None = None) -> str:
     """What a stage says when its command is typed in."""
     return _run(root, ["sh", "-c", command], cores)

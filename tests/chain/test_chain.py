@@ -7,10 +7,12 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
 import pytest
 
 from tests.chain import project
@@ -129,6 +131,33 @@ def test_a_changed_threshold_reruns_masks_and_what_follows_and_back_runs_nothing
     assert graph.after(masks) == set(graph.needs) - {f"ingest@{SCENE}", f"attention@{SCENE}"}
     assert project.fingerprints(clone.root) != clone.files
     project.set_param(clone.root, "masks", "threshold", before["threshold"])
+    assert project.ran(project.dvc(clone.root, "repro")) == []
+    assert project.fingerprints(clone.root) == clone.files
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's help is Linux's")
+def test_a_killed_repro_takes_its_stage_along(clone: Clone) -> None:
+    lock = filelock.FileLock(clone.root / f"artifacts/.work/{SCENE}/nerf/lock")
+
+    def until(running: bool) -> None:
+        for _ in range(6000):
+            try:
+                lock.acquire(timeout=0)
+                lock.release()
+                held = False
+            except filelock.Timeout:
+                held = True
+            if held == running:
+                return
+            time.sleep(0.01)
+        raise AssertionError("a minute has passed")
+
+    process = project.start_dvc(clone.root, "repro", "--force", "--single-item", f"nerf@{SCENE}")
+    until(running=True)
+    process.kill()
+    process.wait()
+    until(running=False)
+    assert not (clone.root / f"artifacts/{SCENE}/nerf").exists()
     assert project.ran(project.dvc(clone.root, "repro")) == []
     assert project.fingerprints(clone.root) == clone.files
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import subprocess
 import sys
@@ -29,9 +30,12 @@ def address() -> Iterator[str]:
 
 
 def _run(root: Path, stage: str, address: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", f"stages.{stage}", "--scene", SCENE, "--scheduler", address]
+    command = [sys.executable, "-m", f"stages.{stage}", "--scene", SCENE]
     params = ["--params", str(root / "params.yaml")]
-    return subprocess.run([*command, *params], cwd=project.ROOT, capture_output=True, text=True)
+    return subprocess.run(
+        [*command, *params], cwd=project.ROOT, capture_output=True, text=True,
+        env={**os.environ, "DERAINNERF_SCHEDULER": address},
+    )  # fmt: skip
 
 
 def _bytes(workshop: Workshop) -> dict[str, str]:
