@@ -39,13 +39,15 @@ def _text(path: Path) -> None:
         ("masks", "attention/view_2.exr", "attention"),
         ("poses", "masks/view_2.png", "masks"),
         ("nerf", "poses/transforms.json", "poses"),
-        ("nerf", "masks/view_2.png", "masks"),
+        ("refine", "masks/view_2.png", "masks"),
+        ("refine", "attention/view_2.exr", "attention"),
+        ("nerf", "refine/view_2.png", "refine"),
         ("nerf", "images/view_2.png", "ingest"),
         ("render", "nerf/field.json", "nerf"),
         ("render", "nerf/field.safetensors", "nerf"),
         ("evaluate", "views/test/view_0.png", "render"),
         ("evaluate", "views/composite/view_2.png", "render"),
-        ("evaluate", "masks/view_2.png", "masks"),
+        ("evaluate", "refine/view_2.png", "refine"),
         ("report", "metrics.json", "evaluate"),
         ("report", "attention/view_2.exr", "attention"),
     ],
@@ -96,9 +98,10 @@ def test_no_pose_at_all(whole: Workshop) -> None:
     whole.refuses("nerf", "pose")
 
 
-def test_attention_of_another_size(whole: Workshop) -> None:
+@pytest.mark.parametrize("stage", ["masks", "refine"])
+def test_attention_of_another_size(whole: Workshop, stage: str) -> None:
     write_map(whole.artifacts / "attention/view_2.exr", np.zeros((90, 120), np.float32))
-    whole.refuses("masks", "120x90", "240x180", "python -m stages.attention")
+    whole.refuses(stage, "120x90", "240x180", "python -m stages.attention")
 
 
 def test_attention_that_is_no_number(whole: Workshop) -> None:
@@ -110,27 +113,29 @@ def test_attention_that_is_no_number(whole: Workshop) -> None:
     whole.refuses("masks", "view_2.exr", "NaN")
 
 
-@pytest.mark.parametrize("stage", ["poses", "nerf", "render", "evaluate"])
+@pytest.mark.parametrize("stage", ["poses", "refine", "nerf", "render", "evaluate"])
 def test_a_mask_of_another_size(whole: Workshop, stage: str) -> None:
-    write_keep_mask(whole.artifacts / "masks/view_2.png", np.ones((90, 120), bool))
+    for folder in ("masks", "refine"):
+        write_keep_mask(whole.artifacts / folder / "view_2.png", np.ones((90, 120), bool))
     whole.refuses(stage, "view_2.png", "120x90", "240x180")
 
 
-@pytest.mark.parametrize("stage", ["nerf", "render", "evaluate"])
+@pytest.mark.parametrize("stage", ["refine", "nerf", "render", "evaluate"])
 @pytest.mark.parametrize("values", [np.full((180, 240), 7), np.full((180, 240, 3), 255)])
 def test_a_mask_that_is_none(whole: Workshop, stage: str, values: np.ndarray) -> None:
-    cv2.imwrite(str(whole.artifacts / "masks/view_2.png"), values.astype(np.uint8))
-    whole.refuses(stage, "masks/view_2.png")
+    for folder in ("masks", "refine"):
+        cv2.imwrite(str(whole.artifacts / folder / "view_2.png"), values.astype(np.uint8))
+    whole.refuses(stage, "view_2.png")
 
 
-@pytest.mark.parametrize("stage", ["attention", "poses", "nerf", "render"])
+@pytest.mark.parametrize("stage", ["attention", "poses", "refine", "nerf", "render"])
 def test_an_image_of_another_size(whole: Workshop, stage: str) -> None:
     write_image(whole.artifacts / "images/view_2.png", np.zeros((90, 120, 3)))
     whole.refuses(stage, "view_2.png")
 
 
 def test_masks_that_leave_nothing_to_fit(whole: Workshop) -> None:
-    for path in (whole.artifacts / "masks").glob("*.png"):
+    for path in (whole.artifacts / "refine").glob("*.png"):
         write_keep_mask(path, np.zeros((180, 240), bool))
     whole.refuses("nerf", "mask")
 
