@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import ctypes
 import importlib
 import logging
 import os
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -220,14 +221,37 @@ def _terminate(signum: int, frame: FrameType | None) -> NoReturn:
 
 
 def _die_with_dvc() -> None:
-    """Under DVC, asks the kernel to end this process with its parent.
+    """Under DVC, sees to it that this process ends with it, where there is /proc.
 
     A killed `dvc repro` would otherwise leave the stage running, writing into the next run's outputs.
     """
-    if not sys.platform.startswith("linux") or "DVC_STAGE" not in os.environ:
+    if "DVC_STAGE" not in os.environ or not Path("/proc/self/environ").exists():
         return
-    parent = os.getppid()
-    pr_set_pdeathsig: Any = 1
-    ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)
-    if os.getppid() != parent:
-        sys.exit(TERMINATED)
+    child = os.getpid()  # DVC's: this process, or the shell that it was started by
+    parent = _parent(child)
+    while _knows_its_stage(parent):
+        child, parent = parent, _parent(parent)
+    threading.Thread(target=_end_without, args=(child, parent), daemon=True).start()
+
+
+def _end_without(child: int, parent: int) -> None:
+    while True:
+        time.sleep(0.1)
+        try:
+            alive = _parent(child) == parent
+        except OSError:
+            alive = False
+        if not alive:
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+
+
+def _parent(process: int) -> int:
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def _knows_its_stage(process: int) -> bool:
+    try:
+        return b"DVC_STAGE=" in Path(f"/proc/{process}/environ").read_bytes()
+    except OSError:
+        return False
