@@ -12,7 +12,7 @@ demo: setup
 	@echo "Open $(abspath artifacts/demo/report/index.html)"
 
 test: setup
-	python -m pytest
+	python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 check: setup
 	ruff check .

@@ -16,6 +16,8 @@ from tqdm import tqdm
 
 from pipeline.errors import UserError
 
+ANSWER_WITHIN = "10s"
+
 
 def cores() -> int:
     """How many cores this process may use."""
@@ -83,7 +85,7 @@ def _on_cluster(tasks: dict[str, Delayed], label: str, address: str, _: int) -> 
     from distributed import Client, KilledWorker, as_completed
 
     try:
-        client = Client(address, timeout="10s")
+        client = Client(address, timeout=ANSWER_WITHIN)
     except (OSError, ValueError) as error:
         raise UserError(
             f"--scheduler {address}: no Dask scheduler answers there ({error}).",

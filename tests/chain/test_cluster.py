@@ -74,7 +74,10 @@ def test_a_fault_on_the_cluster_names_its_image(
     assert not list(there.root.rglob(".*tmp-*"))
 
 
-def test_no_scheduler_at_the_address(whole_scene: Workshop) -> None:
+def test_no_scheduler_at_the_address(
+    whole_scene: Workshop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.parallel.ANSWER_WITHIN", "1s")
     whole_scene.refuses(
         "attention", "no Dask scheduler answers", flags=("--scheduler", "tcp://127.0.0.1:9")
     )
