@@ -14,7 +14,7 @@ from pipeline.evaluation.poses import pose_numbers, read_true_cameras
 from pipeline.evaluation.references import find_references
 from pipeline.evaluation.rounds import score_rounds
 from pipeline.evaluation.score import Files, score_image
-from pipeline.evaluation.summary import as_csv, headline, summarise
+from pipeline.evaluation.summary import as_csv, conventions, headline, summarise
 from pipeline.io.atomic import write_json, write_text
 from pipeline.io.scene import ImageRecord, read_images_json
 from pipeline.io.transforms import read_transforms
@@ -55,14 +55,7 @@ def main(job: Job, params: Params) -> str:
         f"{_shown(job, truth)} does not exist",
     )
     metrics["rounds"] = score_rounds(paths.refine, files, params.coverage_threshold)
-    metrics["conventions"] = {
-        "data_range": 1.0,
-        "flip": f"LDR, {flip.PIXELS_PER_DEGREE} pixels per degree, mean over pixels and images",
-        "lpips_net": lpips.NET,
-        "mask_threshold": params.coverage_threshold,
-        "psnr": "mean over images of the PSNR of the selected pixels, RGB",
-        "ssim": "Gaussian window, sigma 1.5, 11 pixels, RGB",
-    }
+    metrics["conventions"] = conventions(params.coverage_threshold)
     table = {record.name: {"split": record.split, **rows[record.name]} for record in records}
     write_text(paths.metrics_csv, as_csv(table))
     write_json(paths.metrics, metrics)

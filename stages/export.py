@@ -7,20 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import Field
 
-from pipeline.errors import UserError
 from pipeline.geometry.fuse import DepthView, fuse
 from pipeline.io.atomic import publish_dir, write_npy
 from pipeline.io.images import read_image, resized, write_image, write_photo
 from pipeline.io.llff import poses_bounds
-from pipeline.io.maps import read_depth, read_map, write_depth
+from pipeline.io.maps import write_depth
 from pipeline.io.masks import fit_mask, rain_mask, write_keep_mask
 from pipeline.io.ply import write_ply
-from pipeline.io.posed import PosedImage, read_posed_images
-from pipeline.io.straighten import common_pinholes, straighteners_to
-from pipeline.io.transforms import View, read_transforms, write_transforms
+from pipeline.io.straight import StraightScene, read_straight
+from pipeline.io.transforms import write_transforms
 from pipeline.sfm import read_sparse, sparse_points, write_straight
 from pipeline.stage import Job, Section, run
 
@@ -37,47 +34,9 @@ class Params(Section):
     dense_agreeing: Annotated[int, Field(ge=1, le=8)]
 
 
-class Scene:
-    """What is exported: posed images with their final masks, and their straight forms."""
-
-    def __init__(self, job: Job) -> None:
-        self.paths = job.paths
-        refined, first = job.paths.refine, job.paths.masks
-        masks = refined if refined.is_dir() else first
-        views = read_transforms(job.paths.poses / "transforms.json")
-        self.images = read_posed_images(job.paths.images, masks if masks.is_dir() else None, views)
-        if not self.images:
-            raise UserError(
-                f"{job.paths.poses} has no posed image.", "Run `python -m stages.poses`."
-            )
-        views_ = [image.view for image in self.images]
-        self.straight = common_pinholes(views_)
-        self.straighten = straighteners_to(views_, self.straight)
-
-    def straight_rgb(self, image: PosedImage) -> np.ndarray:
-        """The photo (H, W, 3) in [0, 1] as the common pinhole shows it."""
-        return np.clip(self.straighten[image.view.name](image.rgb), 0.0, 1.0)
-
-    def straight_keep(self, image: PosedImage) -> np.ndarray:
-        """Its keep mask (H, W)."""
-        return self.straighten[image.view.name](image.keep_mask.astype(np.uint8)) > 0
-
-    def straight_depth(self, view: View) -> np.ndarray | None:
-        """The rendered depth (H, W) along z, 0 where no photo saw the surface; None without one."""
-        stem = Path(view.name).stem
-        path, seen = self.paths.views / f"depth/{stem}.exr", self.paths.views / f"seen/{stem}.exr"
-        if not path.is_file():
-            return None
-        depth = read_depth(path)
-        if seen.is_file():
-            known = fit_mask(read_map(seen, "render") > 0, (view.width, view.height))
-            depth = np.where(known, depth, 0).astype(np.float32)
-        return self.straighten[view.name](depth)
-
-
 def main(job: Job, params: Params) -> str:
     """Makes `artifacts/<scene>/export/` from the images, masks, poses and views there are."""
-    scene = Scene(job)
+    scene = read_straight(job.paths)
     export = job.paths.artifacts / "export"
     with publish_dir(export) as fresh:
         for name in params.formats:
@@ -85,25 +44,23 @@ def main(job: Job, params: Params) -> str:
     return f"{len(scene.images)} photos as {', '.join(params.formats)} in {export}"
 
 
-def _nerfstudio(scene: Scene, folder: Path, params: Params) -> None:
+def _nerfstudio(scene: StraightScene, folder: Path, params: Params) -> None:
     for image in scene.images:
         write_image(folder / "images" / image.view.name, image.rgb)
         write_keep_mask(folder / "masks" / image.view.name, image.keep_mask)
     write_ply(folder / "sparse_pc.ply", *sparse_points(read_sparse(scene.paths.poses / "sparse")))
-    views = [image.view for image in scene.images]
-    extras = {"ply_file_path": "sparse_pc.ply"}
+    views, extras = [image.view for image in scene.images], {"ply_file_path": "sparse_pc.ply"}
     write_transforms(folder / "transforms.json", views, extras, beside="")
 
 
-def _colmap(scene: Scene, folder: Path, params: Params) -> None:
+def _colmap(scene: StraightScene, folder: Path, params: Params) -> None:
     for image in scene.images:
         write_image(folder / "images" / image.view.name, scene.straight_rgb(image))
         write_keep_mask(folder / "masks" / f"{image.view.name}.png", scene.straight_keep(image))
-    model = read_sparse(scene.paths.poses / "sparse")
-    write_straight(model, scene.straight, folder / "sparse/0")
+    write_straight(read_sparse(scene.paths.poses / "sparse"), scene.straight, folder / "sparse/0")
 
 
-def _llff(scene: Scene, folder: Path, params: Params) -> None:
+def _llff(scene: StraightScene, folder: Path, params: Params) -> None:
     factor, keep_masks = params.llff_factor, []
     for image in scene.images:
         rgb, view = scene.straight_rgb(image), scene.straight[image.view.name]
@@ -115,31 +72,22 @@ def _llff(scene: Scene, folder: Path, params: Params) -> None:
     write_npy(folder / "rainMask.npy", rain_mask(keep_masks))
 
 
-def _ply(scene: Scene, folder: Path, params: Params) -> None:
+def _ply(scene: StraightScene, folder: Path, params: Params) -> None:
     write_ply(folder / "sparse.ply", *sparse_points(read_sparse(scene.paths.poses / "sparse")))
     views = []
     for image in scene.images:
         view, depth = scene.straight[image.view.name], scene.straight_depth(image.view)
         if depth is not None:
-            clean = scene.straighten[view.name](read_image(_clean(scene.paths.views, view.name)))
-            rgb = np.rint(np.clip(clean, 0, 1) * 255).astype(np.uint8)
-            views.append(
-                DepthView(depth, rgb, view.cam_from_world, view.fx, view.fy, view.cx, view.cy)
-            )
+            camera = (view.cam_from_world, view.fx, view.fy, view.cx, view.cy)
+            views.append(DepthView(depth, scene.straight_field(view.name), *camera))
     if len(views) < 2:
         log.warning("no dense points: run `python -m stages.render` for depth maps")
         return
-    points = fuse(views, step=params.dense_step, agreeing=params.dense_agreeing)
-    write_ply(folder / "dense.ply", *points)
+    dense = fuse(views, step=params.dense_step, agreeing=params.dense_agreeing)
+    write_ply(folder / "dense.ply", *dense)
 
 
-def _clean(views: Path, name: str) -> Path:
-    """The field's picture of a photo, fitted or held out."""
-    held_out = views / "test" / name
-    return held_out if held_out.is_file() else views / "input" / name
-
-
-def _depth(scene: Scene, folder: Path, params: Params) -> None:
+def _depth(scene: StraightScene, folder: Path, params: Params) -> None:
     for image in scene.images:
         depth = scene.straight_depth(image.view)
         if depth is None:
@@ -149,7 +97,7 @@ def _depth(scene: Scene, folder: Path, params: Params) -> None:
         write_depth(folder / f"{image.record.stem}.exr", depth)
 
 
-def _photos(scene: Scene, folder: Path, params: Params) -> None:
+def _photos(scene: StraightScene, folder: Path, params: Params) -> None:
     for image in scene.images:
         path = scene.paths.views / "composite" / image.view.name
         if not path.is_file():
@@ -158,7 +106,7 @@ def _photos(scene: Scene, folder: Path, params: Params) -> None:
         write_photo(folder / f"{image.record.stem}.jpg", read_image(path), image.view.fx)
 
 
-WRITERS: dict[str, Callable[[Scene, Path, Params], None]] = {
+WRITERS: dict[str, Callable[[StraightScene, Path, Params], None]] = {
     "nerfstudio": _nerfstudio,
     "colmap": _colmap,
     "llff": _llff,

@@ -16,6 +16,7 @@ from pipeline.io.intake import (
     given_turns,
     given_views,
     masks_said,
+    photo_records,
     straighteners,
     write_given_masks,
 )  # fmt: skip
@@ -87,18 +88,9 @@ def _from_photos(
         },
         job_label="writing images", scheduler=job.scheduler,
     )  # fmt: skip
-    records = [
-        photos[name].record(
-            name,
-            capture.photos[name].relative_to(job.paths.data).as_posix(),
-            plan.turns[name],
-            size,
-        )
-        for name in sorted(plan.turns)
-    ]
+    records = photo_records(capture, photos, plan, size, job.paths.data)
     if capture.views:
-        views = given_views(capture, plan, size, straighten)
-        write_transforms(folder / GIVEN_POSES, views)
+        write_transforms(folder / GIVEN_POSES, given_views(capture, plan, size, straighten))
     share = write_given_masks(folder / GIVEN_MASKS, capture, photos, plan, size, straighten)
     said = plan.said + (masks_said(capture.masked_by, share) if share is not None else [])
     return records, Origin("photos", capture.posed_by, capture.masked_by, plan.left_out, said)

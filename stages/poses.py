@@ -9,23 +9,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 from tqdm import tqdm
 
+from pipeline import sfm
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.scene import GIVEN_POSES, ImageRecord, read_images_json, read_origin
 from pipeline.io.transforms import read_transforms, write_transforms
 from pipeline.parallel import cores
-from pipeline.sfm import (
-    Progress,
-    Reconstructed,
-    Settings,
-    account,
-    reconstruct,
-    triangulate,
-    write_sparse,
-)  # fmt: skip
 from pipeline.stage import Job, Section, run
-
-LONG_VIDEO = 100  # frames
 
 log = logging.getLogger(__name__)
 
@@ -61,9 +51,9 @@ def main(job: Job, params: Params) -> str:
     with tqdm(unit="photo", leave=False) as bar:
         found = _found(job, params, records, partial(_show, bar))
     with publish_dir(paths.poses) as fresh:
-        write_sparse(found.model, fresh / "sparse")
+        sfm.write_sparse(found.model, fresh / "sparse")
         write_transforms(fresh / "transforms.json", found.views.values())
-        write_json(fresh / "poses.json", account(found, len(records)))
+        write_json(fresh / "poses.json", sfm.account(found, len(records)))
     if found.lost and len(found.model_sizes) > 1:
         log.warning("models of %s photos were found; the largest is used", found.model_sizes)
     return (
@@ -73,8 +63,8 @@ def main(job: Job, params: Params) -> str:
 
 
 def _found(
-    job: Job, params: Params, records: list[ImageRecord], progress: Progress
-) -> Reconstructed:
+    job: Job, params: Params, records: list[ImageRecord], progress: sfm.Progress
+) -> sfm.Reconstructed:
     """Poses and points from the photos, or the poses that came with them and points for these."""
     paths, names = job.paths, [record.name for record in records]
     masks = paths.masks if params.use_masks else None
@@ -89,8 +79,8 @@ def _found(
     given = paths.images / GIVEN_POSES
     if params.use_given and given.is_file():
         log.info("the poses that came with the photos are kept; points are found for them")
-        return triangulate(paths.images, masks, names, read_transforms(given), **common)
-    return reconstruct(
+        return sfm.triangulate(paths.images, masks, names, read_transforms(given), **common)
+    return sfm.reconstruct(
         paths.images,
         masks,
         names,
@@ -107,22 +97,17 @@ def _show(bar: tqdm, phase: str, done: int, total: int) -> None:
     bar.refresh()
 
 
-def _settings(params: Params, kind: str, count: int) -> Settings:
+def _settings(params: Params, kind: str, count: int) -> sfm.Settings:
     same = ("camera", "mapper", "max_features", "max_image_size")
     still = params.stationary == "drop" or (params.stationary == "auto" and not params.use_masks)
-    return Settings(
+    return sfm.Settings(
         **{key: getattr(params, key) for key in same},
-        matcher=params.matcher if params.matcher != "auto" else _matcher(kind, count),
+        matcher=params.matcher if params.matcher != "auto" else sfm.fitting_matcher(kind, count),
         masked=params.use_masks,
         still=still,
         refine_focal=params.refine_focal,
         refine_distortion=params.refine_distortion,
     )
-
-
-def _matcher(kind: str, count: int) -> Literal["exhaustive", "sequential"]:
-    """Neighbours only for long videos: every pair costs the square of the count."""
-    return "sequential" if kind == "video" and count > LONG_VIDEO else "exhaustive"
 
 
 if __name__ == "__main__":

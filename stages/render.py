@@ -16,7 +16,7 @@ from pipeline.field.store import load_field
 from pipeline.field.visibility import Witness, shares, witness_count
 from pipeline.geometry.trajectory import camera_path
 from pipeline.io.atomic import publish_dir, write_json
-from pipeline.io.images import read_image, write_image
+from pipeline.io.images import as_bytes, read_image, write_image
 from pipeline.io.maps import read_depth, write_depth, write_map
 from pipeline.io.masks import read_keep_mask
 from pipeline.io.scene import read_images_json
@@ -112,8 +112,7 @@ def _film(job: Job, params: Params, views: list[View], out: Path, how: dict[str,
 
 
 def _frame(nerf: Path, device: str, view: View, pose: np.ndarray, scale: float) -> np.ndarray:
-    rgb = _render(nerf, device, view, pose, scale).rgb
-    return np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return as_bytes(_render(nerf, device, view, pose, scale).rgb)
 
 
 if __name__ == "__main__":

@@ -46,8 +46,8 @@ def main(job: Job, params: Params) -> str:
             "Set it to the released weights (docs/removers.md says where they come from).",
         )
     weights = job.resolve(params.weights)
-    networks_of(params.method, weights, "", job.device)  # what is wrong with them is told once
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest() if weights.is_file() else ""
+    networks_of(params.method, weights, digest, job.device)  # what is wrong with them is told once
     records = read_images_json(job.paths.images)
     names = [record.name for record in records]
     with publish_dir(job.paths.restored) as fresh:

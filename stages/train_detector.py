@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import io
 import json
@@ -14,7 +13,7 @@ from tqdm import tqdm
 
 from pipeline.attention import pools
 from pipeline.attention.samples import Pool
-from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit
+from pipeline.attention.training import Phase, Score, Trainer, curve_rows, curve_text, fit
 from pipeline.attention.weights import DETECTORS, load_network, save_network
 from pipeline.io.atomic import write_bytes, write_text
 from pipeline.io.paths import ScenePaths
@@ -86,9 +85,7 @@ def main(job: Job, params: Params) -> str:
                       on_score=on_score)  # fmt: skip
     target = job.resolve(params.weights)
     save_network(target, average)
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([CURVE, *rows])
-    write_text(target.with_suffix(".csv"), text.getvalue())
+    write_text(target.with_suffix(".csv"), curve_text(rows))
     return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"
 
 

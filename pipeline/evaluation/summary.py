@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pipeline.evaluation import flip, lpips
 from pipeline.evaluation.masks import MaskCounts, mask_scores
 
 Rows = Mapping[str, Mapping[str, float]]
@@ -72,6 +73,18 @@ def average(values: Sequence[float]) -> tuple[float | None, str | None]:
     if infinite:
         return None, f"{infinite} of {len(values)} images are identical to their references"
     return sum(values) / len(values), None
+
+
+def conventions(coverage_threshold: float) -> dict[str, Any]:
+    """How the numbers are meant; a pixel is truly covered when its coverage is above the threshold."""
+    return {
+        "data_range": 1.0,
+        "flip": f"LDR, {flip.PIXELS_PER_DEGREE} pixels per degree, mean over pixels and images",
+        "lpips_net": lpips.NET,
+        "mask_threshold": coverage_threshold,
+        "psnr": "mean over images of the PSNR of the selected pixels, RGB",
+        "ssim": "Gaussian window, sigma 1.5, 11 pixels, RGB",
+    }
 
 
 def headline(metrics: Mapping[str, Any]) -> str:

@@ -57,10 +57,15 @@ def read_image(
     return pixels.astype(np.float32) / np.float32(255)
 
 
+def as_bytes(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] as 8 bits, clipped and rounded."""
+    return np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
+
+
 def write_image(path: Path, rgb: np.ndarray) -> None:
     """Writes an (H, W, 3) RGB image, float in [0, 1] (clipped, rounded) or uint8, as an 8-bit PNG."""
     if rgb.dtype != np.uint8:
-        rgb = np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8)
+        rgb = as_bytes(rgb)
     done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     if not done:
         raise OSError(f"{path}: the image could not be encoded")
@@ -177,7 +182,7 @@ def shrink(pixels: np.ndarray, longest_side: int) -> np.ndarray:
 
 def write_photo(path: Path, rgb: np.ndarray, focal_px: float) -> None:
     """Writes an (H, W, 3) float RGB image as a JPEG that tells its focal length, as a camera's does."""
-    pixels = np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8)
+    pixels = as_bytes(rgb)
     exif = Image.Exif()
     equivalent = focal_px / math.hypot(*pixels.shape[:2]) * _DIAGONAL_35MM
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = max(1, round(equivalent))

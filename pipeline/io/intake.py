@@ -13,6 +13,7 @@ from pipeline.io.given import SAME_SHAPE, GivenView, Straightener, straightened
 from pipeline.io.images import turn
 from pipeline.io.masks import fit_mask, read_foreign_mask, read_rain_mask, write_keep_mask
 from pipeline.io.photos import Photo, Plan
+from pipeline.io.scene import ImageRecord
 from pipeline.io.transforms import View
 
 SUSPECT = 0.6  # a set of masks that drops more than this is likely upside down
@@ -50,6 +51,18 @@ def straighteners(views: Mapping[str, GivenView]) -> dict[str, Straightener]:
         for name, view in views.items()
         if not view.carried
     }
+
+
+def photo_records(
+    capture: Capture, photos: Mapping[str, Photo], plan: Plan, size: tuple[int, int], folder: Path
+) -> list[ImageRecord]:
+    """The records, in name order, of the images (of `size`) that the photos in `folder` become."""
+    return [
+        photos[name].record(
+            name, capture.photos[name].relative_to(folder).as_posix(), plan.turns[name], size
+        )
+        for name in sorted(plan.turns)
+    ]
 
 
 def given_views(

@@ -10,6 +10,7 @@ import av
 import numpy as np
 
 from pipeline.io.atomic import disk_faults
+from pipeline.io.images import as_bytes
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
@@ -30,7 +31,7 @@ def _encode(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "20", "threads": "1"})
         stream.pix_fmt = "yuv420p"
         for number, frame in enumerate(frames):
-            pixels = np.rint(np.clip(frame, 0.0, 1.0) * 255).astype(np.uint8)
+            pixels = as_bytes(frame)
             height, width = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
             if number == 0:
                 stream.height, stream.width = height, width

@@ -7,12 +7,14 @@ import base64
 import cv2
 import numpy as np
 
+from pipeline.io.images import as_bytes
+
 _INK = np.array([0.92, 0.16, 0.35], np.float32)  # what a mask drops
 
 
 def data_uri(rgb: np.ndarray, width: int, quality: int) -> str:
     """A JPEG `data:` address of an image (H, W, 3) in [0, 1], no side above `width`."""
-    pixels = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    pixels = as_bytes(rgb)
     factor = width / max(pixels.shape[:2])
     if factor < 1:
         size = (max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor)))
@@ -30,7 +32,7 @@ def as_uri(data: bytes, kind: str) -> str:
 
 def coloured(values: np.ndarray, palette: int = cv2.COLORMAP_INFERNO) -> np.ndarray:
     """Colours (H, W, 3) in [0, 1] of values (H, W) in [0, 1]."""
-    steps = np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+    steps = as_bytes(values)
     return cv2.applyColorMap(steps, palette)[..., ::-1].astype(np.float32) / 255
 
 

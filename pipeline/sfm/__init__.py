@@ -11,7 +11,14 @@ from pipeline.sfm.export import read_sparse, sparse_points, write_straight
 from pipeline.sfm.given import read_colmap, triangulate
 from pipeline.sfm.model import write_sparse
 from pipeline.sfm.reconstruct import reconstruct
-from pipeline.sfm.result import Attempt, LostImage, Reconstructed, Settings, account
+from pipeline.sfm.result import (
+    Attempt,
+    LostImage,
+    Reconstructed,
+    Settings,
+    account,
+    fitting_matcher,
+)  # fmt: skip
 
 __all__ = [
     "Attempt",
@@ -20,6 +27,7 @@ __all__ = [
     "Reconstructed",
     "Settings",
     "account",
+    "fitting_matcher",
     "read_colmap",
     "read_sparse",
     "reconstruct",

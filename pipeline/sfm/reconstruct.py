@@ -119,7 +119,7 @@ def reconstruct(
 
 
 def silent(phase: str, done: int, total: int) -> None:
-    pass
+    """Nothing: the progress of work that nobody watches."""
 
 
 def ladder(settings: Settings, masks_exist: bool) -> Iterator[tuple[str, Settings]]:

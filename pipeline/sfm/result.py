@@ -14,6 +14,14 @@ Matcher = Literal["exhaustive", "sequential"]
 Mapper = Literal["incremental", "global"]
 
 
+LONG_VIDEO = 100  # frames
+
+
+def fitting_matcher(kind: str, count: int) -> Matcher:
+    """Every pair of photos, but neighbours only for long videos: the pairs are the square of the count."""
+    return "sequential" if kind == "video" and count > LONG_VIDEO else "exhaustive"
+
+
 @dataclass(frozen=True)
 class Settings:
     """How one attempt is made. Lengths in pixels; counts per image.
