@@ -30,7 +30,7 @@ FEWEST_ON_PANE = 2
 SHARE_ON_LENS = 0.25
 MEANS = 0.6  # of the threshold of single maps: a mean seldom reaches their heights
 STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains more than it blurs
-CLEAR = 0.5  # agreement of the residual on a pane from which it tells more than the attention did
+CLEAR = 0.6  # agreement of the residual on the glass from which it adds to what the attention told
 OFF = 25  # the longer side over this: how far poses may put a view off on the pane
 SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
 
@@ -79,8 +79,9 @@ def repair(
     the `attentions`, and again from the residuals; `mode` lens or pane is taken on trust. With
     `gather_attention` the loop starts from the attention gathered there (the general form of
     equation 5). The loop ends early when fewer than the share `settled` of the pixels change, and
-    keeps the masks that it had when the residual shows no glass or when the disagreement inside the
-    new masks is not `contrast` times that outside. Other parameters as in `redraw_views`.
+    keeps the masks that it had when the residual shows no glass, when it agrees there less than is
+    needed to add to the attention (a poor field disagrees everywhere), or when the disagreement
+    inside the new masks is not `contrast` times that outside. Other parameters as in `redraw_views`.
     """
     found = _chosen(find_glass(attentions, cameras, farthest, at_least=agreement), mode)
     masks = list(drop_masks)
@@ -99,11 +100,8 @@ def repair(
         found = _look_again(residuals, cameras, farthest, agreement, found, mode)
         if found.mode == "none":
             return Repaired(done, "what disagrees with the scene does not stay on any glass")
-        if use_attention and found.mode == "pane" and found.pane_agreement < CLEAR:
-            why = (
-                f"the residual does not agree well enough on the pane ({found.pane_agreement:.2f})"
-            )
-            return Repaired(done, why)
+        if use_attention and _agreement(found) < CLEAR:
+            return Repaired(done, f"the residual agrees too little {describe(found)}")
         fitted = sum(values is not None for values in residuals)
         redrawn = redraw_views(
             _glass(found, cameras, attentions if use_attention else residuals),
@@ -138,6 +136,11 @@ def describe(found: Found) -> str:
     if found.mode == "lens":
         return f"on the lens (agreement {found.lens_agreement:.2f})"
     return f"no glass (agreement {max(found.lens_agreement, found.pane_agreement):.2f})"
+
+
+def _agreement(found: Found) -> float:
+    """How well the views agree on the glass that was found."""
+    return found.pane_agreement if found.mode == "pane" else found.lens_agreement
 
 
 def _look_again(

@@ -13,8 +13,10 @@ from pipeline.masking.masks import otsu
 FLOOR = 1e-3  # residuals below it are equal: 8-bit photos hold no less
 LARGEST_HOLE = 0.25  # of the drop around it
 SUREST = 0.02  # attention is never taken for more certain than this
-ATTENTION_WEIGHT = 0.3  # of its log-odds against the log of the residual
-JOIN = 0.5  # between the clear median (0) and Otsu's threshold (1)
+ATTENTION_WEIGHT = 1.0  # of its log-odds against the log of the residual
+# Where a drop begins, between the clear median (0) and Otsu's threshold (1). Later with attention, whose
+# log-odds fall off slowly around a drop.
+JOIN, JOIN_ATTENTION = 0.5, 0.7
 
 
 class Redrawn(NamedTuple):
@@ -44,23 +46,24 @@ def redraw(
 
     What counts is the logarithm of the residual over that of the clear surroundings within `reach`
     cells: a field is worse in foliage than on a road, and drops are smaller than either. The log-odds
-    of the gathered `attention`, where there is one, add to it with a small weight. Otsu's threshold
-    tells what surely is a drop; half-way down to the clear median its surroundings join it. Then an
-    opening 3x3, and holes are filled: water has none.
+    of the gathered `attention`, where there is one, add to it. Otsu's threshold tells what surely is a
+    drop; part of the way down to the clear median its surroundings join it. Then an opening 3x3, and
+    holes are filled: water has none.
     """
     known = np.isfinite(gathered) & (votes >= fewest_votes)
     if known.sum() < 2:
         return Redrawn(previous.copy(), known, float("nan"), float("nan"))
     logs = np.log(np.maximum(np.where(known, gathered, 1.0), FLOOR)).astype(np.float32)
     above = _above_surroundings(logs, known, reach)
-    score = above
+    score, join = above, JOIN
     if attention is not None:
+        join = JOIN_ATTENTION
         odds = np.clip(np.nan_to_num(attention, nan=0.5), SUREST, 1 - SUREST)
         odds = np.log(odds / (1 - odds))
         score = above + ATTENTION_WEIGHT * (odds - np.median(odds[known]))
     sure = otsu(score[known])
     middle = float(np.median(score[known & (score <= sure)]))
-    begin = middle + JOIN * (sure - middle)
+    begin = middle + join * (sure - middle)
     drop_mask = without_holes(joined(known & (score > begin), known & (score > sure)))
     inside, outside = gathered[known & drop_mask], gathered[known & ~drop_mask]
     contrast = float("nan")
