@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from pipeline.masking.glass import GlassCamera, pane_before
@@ -63,3 +64,28 @@ def test_drops_on_the_lens_and_no_drops() -> None:
     done = repair(_look_at(dry), noise, views, drawn, 4.0, rounds=3)
     assert len(done.rounds) == 1
     assert all(np.array_equal(a, b) for a, b in zip(done.rounds[-1].drop_masks, drawn, strict=True))
+
+
+def test_a_scene_that_is_wrong_everywhere_does_not_redraw_good_masks() -> None:
+    views, pane = _views()
+    wet = [wetness(pane, views[0])] * len(views)
+    rng = np.random.default_rng(3)
+
+    def look(drop_masks: Sequence[np.ndarray], found: object) -> list[np.ndarray | None]:
+        """Wet pixels differ, and so do patches that lie elsewhere in every view."""
+        height, width = wet[0].shape
+        patches = [rng.random((height // 12, width // 12)) < 0.25 for _ in wet]
+        return [
+            np.where((one > 0.5) | (cv2.resize(patch.astype(np.uint8), (width, height)) > 0), 0.1, 0.01)
+            .astype(np.float32)
+            for one, patch in zip(wet, patches, strict=True)
+        ]  # fmt: skip
+
+    drawn = [one > 0.3 for one in wet]
+    done = repair(look, wet, views, drawn, 4.0, rounds=3, gather_attention=False)
+    assert len(done.rounds) == 1
+    assert "agrees too little on the lens" in done.ended
+    assert all(np.array_equal(a, b) for a, b in zip(done.rounds[0].drop_masks, drawn, strict=True))
+    # Where no attention was asked, the residual is all there is, and it is followed.
+    alone = repair(look, wet, views, drawn, 4.0, rounds=1, use_attention=False, contrast=1.0)
+    assert len(alone.rounds) == 2
