@@ -64,7 +64,9 @@ def redraw(
     sure = otsu(score[known])
     middle = float(np.median(score[known & (score <= sure)]))
     begin = middle + join * (sure - middle)
-    drop_mask = without_holes(joined(known & (score > begin), known & (score > sure)))
+    # Old masks stand in where nobody can tell: as holes they would take their neighbours along.
+    wide, seeds = (np.where(known, score > level, previous) for level in (begin, sure))
+    drop_mask = without_holes(joined(wide, seeds))
     inside, outside = gathered[known & drop_mask], gathered[known & ~drop_mask]
     contrast = float("nan")
     if inside.size and outside.size:

@@ -66,6 +66,17 @@ def test_a_drop_is_where_the_residual_is_large_and_old_masks_stay_where_nobody_v
     assert 1 < found.level < 10
 
 
+def test_cells_without_votes_do_not_eat_the_drop_around_them() -> None:
+    rng = np.random.default_rng(0)
+    wet = np.hypot(*(np.indices((60, 60)) - 30)) < 12
+    gathered = np.where(wet, 0.1, 0.01 + 0.002 * rng.random(wet.shape)).astype(np.float32)
+    votes = np.where(rng.random(wet.shape) < 0.4, 0, 9)  # scattered: no 3x3 square is without one
+    found = redraw(gathered, votes, wet, 2, reach=10)
+    # But for corners that no 3x3 square fits into.
+    assert (found.drop_mask & wet).sum() > 0.97 * wet.sum()
+    assert not (found.drop_mask & ~wet).any()
+
+
 def test_without_any_votes_the_old_mask_stays() -> None:
     previous = np.eye(5, dtype=bool)
     found = redraw(np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1, reach=2)
