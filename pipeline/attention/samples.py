@@ -43,16 +43,19 @@ def wetness(coverage: Tensor) -> Tensor:
     return coverage.clamp(0, 1).sqrt()
 
 
-def coverage_of_pair(rainy: np.ndarray, clean: np.ndarray) -> np.ndarray:
+def coverage_of_pair(
+    rainy: np.ndarray, clean: np.ndarray, difference: float = PAIR_DIFFERENCE
+) -> np.ndarray:
     """Coverage (H,W) uint8, 0 or 255, of a photo pair: where any channel differs by more than 30.
 
-    rainy, clean: (H,W,3) uint8 of one size. Both are smoothed over 3x3 pixels first, so that
-    sensor noise does not count as water. Source: Qian et al., CVPR 2018, section 4.1.
+    rainy, clean: (H,W,3) uint8 of one size; difference: in [0,1], instead of 30/255. Both are
+    smoothed over 3x3 pixels first, so that sensor noise does not count as water. Source: Qian et al.,
+    CVPR 2018, section 4.1.
     """
     if rainy.shape != clean.shape:
         raise ValueError(f"a pair differs in size: {rainy.shape} and {clean.shape}")
     smooth = [cv2.blur(image.astype(np.float32) / 255, (3, 3)) for image in (rainy, clean)]
-    differs = np.abs(smooth[0] - smooth[1]).max(axis=2) > PAIR_DIFFERENCE
+    differs = np.abs(smooth[0] - smooth[1]).max(axis=2) > difference
     return np.where(differs, 255, 0).astype(np.uint8)
 
 
