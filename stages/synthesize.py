@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import shutil
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
 
-from pipeline.drops import storing, synthesis
+from pipeline.drops import posed, storing, synthesis
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir, write_json
+from pipeline.io.capture import find_capture
 from pipeline.io.photos import list_photos
 from pipeline.parallel import map_named
+from pipeline.sfm import read_colmap
 from pipeline.stage import Job, Section, run
 
+log = logging.getLogger(__name__)
 MARKER = "truth/synthesize.json"
 Side = Annotated[int, Field(ge=16, le=8192)]
 
@@ -27,6 +31,8 @@ class Params(Section):
     mode: Literal["lens", "scene", "paint"]
     place: str
     source: Annotated[str, Field(description="folder of clean photos, for mode paint")]
+    paint_pane: Literal["lens", "scene"]
+    unit_m: PositiveFloat
     seed: Annotated[int, Field(ge=0)]
     views: Annotated[int, Field(ge=1, le=1000)]
     width: Side
@@ -73,6 +79,22 @@ def _painted(job: Job, params: Params, work: Path) -> None:
     map_named(storing.paint_view, items, job_label="painting", scheduler=job.scheduler)
 
 
+def _painted_in_the_scene(job: Job, params: Params, work: Path) -> None:
+    """Wets the photos of a capture with poses by one pane that stays in the scene."""
+    folder = job.resolve(params.source)
+    capture = find_capture(folder, 2, read_colmap)
+    recipe = params.model_dump(mode="json")
+    photos, on_pane = posed.plan(recipe, capture, folder)
+    dry = len(capture.photos) - len(photos)
+    if dry:
+        log.warning("%s photos without a pose are left out", dry)
+    items = {
+        stem: (recipe, k, photos[stem], on_pane, work) for k, stem in enumerate(sorted(photos))
+    }
+    map_named(posed.paint_view, items, job_label="painting", scheduler=job.scheduler)
+    write_json(work / "truth/cameras.json", posed.true_cameras(photos))
+
+
 def main(job: Job, params: Params) -> str:
     """Makes `data/<scene>/`, unless somebody else's photos are there."""
     final = job.paths.data
@@ -83,7 +105,9 @@ def main(job: Job, params: Params) -> str:
     recipe = params.model_dump(mode="json")
     key = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
     work = job.paths.work("synthesize") / key
-    make = _painted if params.mode == "paint" else _rendered
+    make = _rendered
+    if params.mode == "paint":
+        make = _painted if params.paint_pane == "lens" else _painted_in_the_scene
     make(job, params, work)
     write_json(work / MARKER, recipe)
     with publish_dir(final) as fresh:

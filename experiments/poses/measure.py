@@ -111,7 +111,7 @@ def _wetted(case: Case, coverage: float, seed: int = 5) -> Case:
             aperture_mm=1.0, field_of_view_deg=62.0,
         )  # fmt: skip
         write_image(folder / "images" / path.name, wet)
-        write_keep_mask(folder / "true" / path.name, share <= COVERED * 255)
+        write_keep_mask(folder / "true" / path.name, share <= COVERED)
     return Case(name, folder / "images", {"true": folder / "true"}, case.focal_px, case.truth)
 
 

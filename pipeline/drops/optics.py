@@ -94,16 +94,20 @@ class Environment:
     """Linear light from every direction in front of the pane, as a stereographic map.
 
     The direction (x, y, z) lies at (x, y) / (1 + z); the map spans [-reach, reach] on both axes.
+    turn (3, 3): takes the directions that are asked for into the map's frame, the camera's.
     """
 
     light: Image
     reach: float
+    turn: NDArray | None = None
 
     def look(self, direction: NDArray) -> Image:
         """Light (..., 3) from unit directions (..., 3); those far behind the pane are clamped."""
         side = self.light.shape[0]
         scale = side / (2 * self.reach)
         flat = direction.reshape(-1, 3).astype(np.float32)
+        if self.turn is not None:
+            flat = flat @ self.turn.T.astype(np.float32)
         plane = flat[:, :2] / np.maximum(1 + flat[:, 2:], 0.2)
         place = np.clip(plane * scale + (side / 2 - 0.5), 0, side - 1)
         columns = 4096  # cv2.remap wants both sides below 32768
@@ -133,18 +137,20 @@ def make_environment(
     sky: NDArray | None = None,
     ground: NDArray | None = None,
     surroundings: Image | None = None,
+    centre: tuple[float, float] | None = None,
     side: int = 256,
     reach: float = 1.1,
 ) -> Environment:
     """What lies before the pane: the photo where it shows it, a smooth guess of the rest around.
 
-    light: (H, W, 3) linear light of the photo, its optical axis at its centre. Beyond its border
-    the colours fade within about half its width into the means along the border, and from there
-    into `sky` (3,) above and `ground` (3,) below; by default the brightest colour of the upper
-    part and a dark one of the lower. surroundings: (h, w, 3) factors, about 1, that give the guess
-    some structure.
+    light: (H, W, 3) linear light of the photo; centre: pixel (x, y) of its optical axis, by default
+    the middle. Beyond its border the colours fade within about half its width into the means along
+    the border, and from there into `sky` (3,) above and `ground` (3,) below; by default the brightest
+    colour of the upper part and a dark one of the lower. surroundings: (h, w, 3) factors, about 1,
+    that give the guess some structure.
     """
     height, width = light.shape[:2]
+    middle = (width / 2, height / 2) if centre is None else centre
     small = cv2.resize(light, (48, 48), interpolation=cv2.INTER_AREA)
     if sky is None:
         sky = np.percentile(small[:24].reshape(-1, 3), 97, axis=0)
@@ -152,8 +158,8 @@ def make_environment(
         ground = 0.7 * small[32:].reshape(-1, 3).mean(axis=0)
     toward = _directions(side, reach)
     depth = np.maximum(toward[..., 2], 0.05)
-    u = toward[..., 0] / depth * focal_px + width / 2
-    v = toward[..., 1] / depth * focal_px + height / 2
+    u = toward[..., 0] / depth * focal_px + middle[0]
+    v = toward[..., 1] / depth * focal_px + middle[1]
     behind = toward[..., 2] <= 0.05
     beyond = np.maximum(np.abs(u / width - 0.5), np.abs(v / height - 0.5)) - 0.5
     beyond = np.where(behind, 9.0, beyond).astype(np.float32)
@@ -170,20 +176,26 @@ def make_environment(
     fade = np.clip(beyond / 0.5, 0, 1)[..., None]
     guess = near + (far - near) * (fade * fade * (3 - 2 * fade))
 
-    step = 2 * reach / side * focal_px * 2  # photo pixels per map pixel at the centre
+    # Photo pixels per map pixel, at the centre.
+    photo = _sampled(light, u, v, step=2 * reach / side * focal_px * 2)
+    inside = np.clip(-beyond / 0.04, 0, 1)[..., None]
+    return Environment((photo * inside + guess * (1 - inside)).astype(np.float32), reach)
+
+
+def _sampled(light: Image, u: NDArray, v: NDArray, step: float) -> Image:
+    """The picture at its pixels (u, v), first scaled down where those lie `step` pixels apart."""
+    height, width = light.shape[:2]
     scaled = light
     if step > 1.5:
         size = (max(round(width / step * 1.5), 2), max(round(height / step * 1.5), 2))
         scaled = cv2.resize(light, size, interpolation=cv2.INTER_AREA)
     sx, sy = scaled.shape[1] / width, scaled.shape[0] / height
-    photo = cv2.remap(
+    return cv2.remap(
         scaled,
         np.clip(u * sx - 0.5, 0, scaled.shape[1] - 1).astype(np.float32),
         np.clip(v * sy - 0.5, 0, scaled.shape[0] - 1).astype(np.float32),
         cv2.INTER_LINEAR,
     )
-    inside = np.clip(-beyond / 0.04, 0, 1)[..., None]
-    return Environment((photo * inside + guess * (1 - inside)).astype(np.float32), reach)
 
 
 def through_drop(

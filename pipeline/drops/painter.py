@@ -55,12 +55,9 @@ def paint(
     height, width = image.shape[:2]
     if not drops:
         return image.copy(), np.zeros((height, width), np.float32)
-    light = srgb_to_linear(image)
-    bright = expand_highlights(light, highlight)
-    small = cv2.resize(bright, (32, 32), interpolation=cv2.INTER_AREA)
-    sky = np.percentile(small[:16].reshape(-1, 3), 95, axis=0) * sky_gain
-    sky = 0.5 * sky + 0.5 * sky.mean()  # the sky is greyer than what stands before it
-    environment = make_environment(bright, focal_px, sky=sky, surroundings=surroundings)
+    light, environment = photo_light(
+        image, focal_px, highlight=highlight, sky_gain=sky_gain, surroundings=surroundings
+    )
     blur = blur_diameter_px(focal_px, aperture_radius, pane_distance, focus_distance)
     layer = paint_layer(
         (height, width),
@@ -72,6 +69,34 @@ def paint(
         rim_light=rim_light,
         supersample=supersample,
     )
+    return composed(image, light, layer)
+
+
+def photo_light(
+    image: Image,
+    focal_px: float,
+    *,
+    highlight: float,
+    sky_gain: float,
+    surroundings: Image | None = None,
+    centre: tuple[float, float] | None = None,
+) -> tuple[Image, Environment]:
+    """Linear light (H, W, 3) of an sRGB photo, and what drops before it look into; see `paint`."""
+    light = srgb_to_linear(image)
+    bright = expand_highlights(light, highlight)
+    small = cv2.resize(bright, (32, 32), interpolation=cv2.INTER_AREA)
+    sky = np.percentile(small[:16].reshape(-1, 3), 95, axis=0) * sky_gain
+    sky = 0.5 * sky + 0.5 * sky.mean()  # the sky is greyer than what stands before it
+    return light, make_environment(
+        bright, focal_px, sky=sky, surroundings=surroundings, centre=centre
+    )
+
+
+def composed(image: Image, light: Image, layer: Image) -> tuple[Image, NDArray[np.float32]]:
+    """The layer (H, W, 4) over the photo, sRGB, and its coverage; where there is none, `image` itself.
+
+    light: linear light (H, W, 3) of the photo.
+    """
     alpha = np.clip(layer[..., 3], 0.0, 1.0)
     wet = linear_to_srgb(layer[..., :3] + light * (1 - alpha[..., None]))
     return np.where(alpha[..., None] > 0, wet, image).astype(np.float32), alpha
@@ -109,14 +134,37 @@ def paint_layer(
     ray[:, 1] = (at[0] + 0.5 - shape[0] / 2) / (focal_px * supersample)
     ray[:, 2] = 1.0
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    layer = np.zeros((*shape, 4), np.float32)
+    return lit_layer(
+        covered, slope, ray, environment, pad=pad, blur_px=blur_px, rim_light=rim_light, supersample=supersample
+    )  # fmt: skip
+
+
+def lit_layer(
+    covered: NDArray[np.bool_],
+    slope: Image,
+    ray: Image,
+    environment: Environment,
+    *,
+    pad: int,
+    blur_px: float,
+    rim_light: float,
+    supersample: int,
+) -> Image:
+    """Premultiplied linear RGB and alpha (H, W, 4) of water, defocused, its border of `pad` cut off.
+
+    covered (R, C), slope (R, C, 2): on a raster `supersample` times finer than the photo with its
+    border. ray (N, 3): unit directions through the covered raster pixels, row by row.
+    """
+    at = np.nonzero(covered)
+    layer = np.zeros((*covered.shape, 4), np.float32)
     if len(ray):
         layer[at[0], at[1], :3] = through_drop(ray, slope[at], environment, rim_light=rim_light)
         layer[at[0], at[1], 3] = 1.0
+    rows, columns = (n // supersample for n in covered.shape)
     if supersample > 1:
         layer = cv2.resize(layer, (columns, rows), interpolation=cv2.INTER_AREA)
     layer = defocus(layer, blur_px)
-    inside = layer[pad : pad + size[0], pad : pad + size[1]].copy()
+    inside = layer[pad : rows - pad, pad : columns - pad].copy()
     inside[inside[..., 3] < 1e-4] = 0.0  # rounding of the convolution
     return inside
 

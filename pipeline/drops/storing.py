@@ -52,32 +52,38 @@ def _prepared(key: str) -> tuple[Any, ...]:
     camera, poses, drops = plan(recipe)
     fixed = recipe["mode"] == "scene"
     pane_m = synthesis.SCENE_PANE_M if fixed else recipe["pane_m"]
-    stains = synthesis.pane_stains(recipe["seed"], camera, recipe["stains"], pane_m, fixed=fixed)
+    half = synthesis.stained_half(camera, pane_m, fixed=fixed)
+    stains = synthesis.pane_stains(recipe["seed"], camera.focal_px, recipe["stains"], pane_m, half)
     return baked, synthesis.place_exposure(baked, camera), camera, poses, drops, stains
 
 
 def render_view(recipe: Recipe, number: int, stem: str, work: Path) -> None:
     """Renders view `number` into `work`; its photo comes last and says that the view is done."""
     baked, exposure, camera, poses, drops, stains = _prepared(json.dumps(recipe, sort_keys=True))
-    if recipe["mode"] == "lens":
-        drops = crept(drops, number * recipe["drift_mm"] / 1000)
+    drops = crept(drops, number * recipe["drift_mm"] / 1000)
     view = synthesis.wet_view(
         baked, camera, poses[number], drops, stains=stains, exposure=exposure, spp=recipe["spp"],
         clean_spp=recipe["clean_spp"], seed=recipe["seed"] * 10007 + number,
         pane_m=recipe["pane_m"] if recipe["mode"] == "lens" else None,
     )  # fmt: skip
-    encode(work / f"truth/clean/{stem}.jpg", view.clean, 98)
-    encode(work / f"truth/coverage/{stem}.png", view.coverage)
     if recipe["maps"]:
-        for name, write, values in (
-            ("alpha", write_map, view.alpha),
-            ("depth", write_depth, view.depth),
-        ):
-            (work / "truth" / name).mkdir(parents=True, exist_ok=True)
-            write(work / f"truth/{name}/{stem}.exr", values)
-        keep_mask = np.where(view.alpha > COVERED, 0, 255).astype(np.uint8)
+        (work / "truth/depth").mkdir(parents=True, exist_ok=True)
+        write_depth(work / f"truth/depth/{stem}.exr", view.depth)
+    store(recipe, work, stem, view.rainy, view.clean, view.alpha)
+
+
+def store(
+    recipe: Recipe, work: Path, stem: str, rainy: np.ndarray, clean: np.ndarray, alpha: np.ndarray
+) -> None:
+    """Writes a photo with its clean reference and coverage; the photo comes last."""
+    encode(work / f"truth/clean/{stem}.jpg", clean, 98)
+    encode(work / f"truth/coverage/{stem}.png", synthesis.to_bytes(alpha))
+    if recipe["maps"]:
+        (work / "truth/alpha").mkdir(parents=True, exist_ok=True)
+        write_map(work / f"truth/alpha/{stem}.exr", alpha)
+        keep_mask = np.where(alpha > COVERED, 0, 255).astype(np.uint8)
         encode(work / f"truth/masks/{stem}.png", keep_mask)
-    encode(work / f"{stem}.jpg", view.rainy, 95)
+    encode(work / f"{stem}.jpg", rainy, 95)
 
 
 def paint_view(recipe: Recipe, number: int, path: Path, work: Path) -> None:
@@ -86,7 +92,5 @@ def paint_view(recipe: Recipe, number: int, path: Path, work: Path) -> None:
     clean = synthesis.shrunk(read_photo(path)[0], longest)
     keys = ("seed", "pane_m", "coverage", "radius_mm", "aperture_mm", "field_of_view_deg", "stains")
     creep_m = number * recipe["drift_mm"] / 1000
-    rainy, coverage = synthesis.painted(clean, creep_m=creep_m, **{k: recipe[k] for k in keys})
-    encode(work / f"truth/clean/{path.stem}.jpg", clean, 98)
-    encode(work / f"truth/coverage/{path.stem}.png", coverage)
-    encode(work / f"{path.stem}.jpg", rainy, 95)
+    rainy, alpha = synthesis.painted(clean, creep_m=creep_m, **{k: recipe[k] for k in keys})
+    store(recipe, work, path.stem, rainy, clean, alpha)

@@ -14,11 +14,21 @@ from pipeline.drops import mitsuba_scene as scene
 from pipeline.drops.creep import crept
 from pipeline.drops.optics import blur_diameter_px, linear_to_srgb, srgb_to_linear
 from pipeline.drops.painter import paint
+from pipeline.drops.pane import (
+    Pane,
+    Shot,
+    depth_on_axis,
+    paint_pane,
+    pane_before,
+    pixel_from_pane,
+)
 from pipeline.drops.shape import Drop, sample_drops
 from pipeline.drops.stains import over, sample_stains, seen_layer, stained
+from pipeline.geometry.cameras import intrinsic_matrix
 
 Bytes = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
+FOCUS_M = scene.Camera.focus_m  # where the lens of every photo is sharp
 SCENE_PANE_M = 0.45  # from the mean camera to a pane that stays in the scene
 LENS_PANE_M = 0.12
 REACH = (0.66, 0.42)  # how far cameras stray from the grid's centre, metres, with their jitter
@@ -112,40 +122,52 @@ def cameras(camera: scene.Camera, poses: dict[str, Matrix]) -> dict[str, Any]:
 
 def pane_stains(
     seed: int,
-    camera: scene.Camera,
+    focal_px: float,
     kinds: Mapping[str, float],
     pane_m: float,
-    *,
-    fixed: bool = False,
+    half: Sequence[float] | Matrix,
 ) -> Stains | None:
     """What else sits on the pane, by kind and share covered; None for nothing. Sizes are those of
 
-    a pane on the lens (0.12 m) and grow with the distance. fixed: a pane that stays in the scene.
+    a pane on the lens (0.12 m) and grow with the distance. half: width and height of half the pane.
     """
     if not any(kinds.values()):
         return None
-    pitch = pane_m / camera.focal_px
-    half = np.array([camera.width, camera.height]) / 2 * pitch * 1.05 + camera.aperture_m
-    if fixed:
-        half = (half + REACH) * 1.08
+    pitch = pane_m / focal_px
     shape = (round(2 * half[1] / pitch), round(2 * half[0] / pitch))
     layer = np.zeros((*shape, 4), np.float32)
     rng = np.random.default_rng([seed, 4])
-    per_mm = camera.focal_px / LENS_PANE_M / 1000
+    per_mm = focal_px / LENS_PANE_M / 1000
     for kind, share in sorted(kinds.items()):
         layer = over(sample_stains(rng, kind, shape, share, per_mm), layer)
     return Stains(layer, pitch)
 
 
+def stained_half(camera: scene.Camera, pane_m: float, *, fixed: bool = False) -> Matrix:
+    """Half width and height (2,) of a pane to stain; fixed: of one that stays in a rendered scene."""
+    view = np.array([camera.width, camera.height]) / 2 * (pane_m / camera.focal_px)
+    half = view * 1.05 + camera.aperture_m
+    return (half + REACH) * 1.08 if fixed else half
+
+
 def stains_seen(
-    stains: Stains, camera: scene.Camera, cam_from_pane: Matrix
+    stains: Stains,
+    k: Matrix,
+    size: tuple[int, int],
+    cam_from_pane: Matrix,
+    aperture_m: float,
+    focus_m: float,
 ) -> npt.NDArray[np.float32]:
-    """The stains' layer (H, W, 4) in one camera; cam_from_pane (4, 4), metres."""
-    f, w, h = camera.focal_px, camera.width, camera.height
-    k = np.array([[f, 0, w / 2], [0, f, h / 2], [0, 0, 1]])
-    pixel_from_pane = k @ cam_from_pane[:3][:, [0, 1, 3]]
-    blur = blur_diameter_px(f, camera.aperture_m, float(cam_from_pane[2, 3]), camera.focus_m)
-    return seen_layer(stains.layer, stains.pitch_m, pixel_from_pane, (h, w), blur)
+    """The stains' layer (H, W, 4) in one camera of `size` (w, h); cam_from_pane (4, 4), metres."""
+    blur = blur_diameter_px(float(k[0, 0]), aperture_m, depth_on_axis(cam_from_pane), focus_m)
+    seen = pixel_from_pane(k, cam_from_pane)
+    return seen_layer(stains.layer, stains.pitch_m, seen, size[::-1], blur)
+
+
+def camera_matrix(camera: scene.Camera) -> Matrix:
+    """K (3, 3) of a camera whose axis meets the middle of its picture."""
+    f = camera.focal_px
+    return intrinsic_matrix(f, f, camera.width / 2, camera.height / 2)
 
 
 def place_exposure(baked: scene.Baked, camera: scene.Camera) -> float:
@@ -186,7 +208,10 @@ def wet_view(
         cam_from_pane = cam_from_world @ fixed if fixed is not None else np.eye(4)
         if fixed is None:
             cam_from_pane[2, 3] = pane_m
-        layer = stains_seen(stains, camera, cam_from_pane)
+        layer = stains_seen(
+            stains, camera_matrix(camera), (camera.width, camera.height), cam_from_pane,
+            camera.aperture_m, camera.focus_m,
+        )  # fmt: skip
         radiance = stained(radiance, layer)
         alpha = 1 - (1 - alpha) * (1 - layer[..., 3])
     # Other random numbers than the rainy picture's, so that their noise is not the same.
@@ -221,8 +246,8 @@ def painted(
     focal: float | None = None,
     creep_m: float = 0.0,
     stains: Mapping[str, float] | None = None,
-) -> tuple[Bytes, Bytes]:
-    """A photo (H, W, 3) wetted by the painter, and its coverage (H, W); both uint8.
+) -> tuple[Bytes, npt.NDArray[np.float32]]:
+    """A photo (H, W, 3) uint8 wetted by the painter, and its coverage (H, W) in [0, 1].
 
     focal: pixels, if known, else from the field of view of the longer side. The drops follow from
     the seed and the photo's shape alone: the same for all photos of one camera, but for the creep (of
@@ -236,11 +261,70 @@ def painted(
         photo.astype(np.float32) / np.float32(255), crept(drops, creep_m), focal_px=focal, pane_distance=pane_m,
         aperture_radius=camera.aperture_m, focus_distance=camera.focus_m,
     )  # fmt: skip
-    spots = pane_stains(seed, camera, stains or {}, pane_m)
-    if spots is not None:
-        pane = np.eye(4)
-        pane[2, 3] = pane_m
-        layer = stains_seen(spots, camera, pane)
-        rainy = linear_to_srgb(stained(srgb_to_linear(rainy), layer))
-        alpha = 1 - (1 - alpha) * (1 - layer[..., 3])
-    return to_bytes(rainy), to_bytes(alpha)
+    spots = pane_stains(seed, focal, stains or {}, pane_m, stained_half(camera, pane_m))
+    pane = np.eye(4)
+    pane[2, 3] = pane_m
+    return _with_stains(rainy, alpha, spots, camera_matrix(camera), pane, camera.aperture_m)
+
+
+def _with_stains(
+    rainy: npt.NDArray[np.float32],
+    alpha: npt.NDArray[np.float32],
+    spots: Stains | None,
+    k: Matrix,
+    cam_from_pane: Matrix,
+    aperture_m: float,
+) -> tuple[Bytes, npt.NDArray[np.float32]]:
+    """The painted photo and its coverage with what else is on the pane."""
+    if spots is None:
+        return to_bytes(rainy), alpha
+    size = (alpha.shape[1], alpha.shape[0])
+    layer = stains_seen(spots, k, size, cam_from_pane, aperture_m, FOCUS_M)
+    rainy = linear_to_srgb(stained(srgb_to_linear(rainy), layer))
+    return to_bytes(rainy), 1 - (1 - alpha) * (1 - layer[..., 3])
+
+
+def pane_plan(
+    shots: Mapping[str, Shot],
+    *,
+    seed: int,
+    pane_m: float,
+    coverage: float,
+    radius_mm: tuple[float, float],
+    aperture_mm: float,
+    stains: Mapping[str, float],
+) -> tuple[Pane, list[Drop], Stains | None]:
+    """A pane that stays in the scene, `pane_m` before the mean of the `shots`, and what is on it.
+
+    For cameras that do not move, drops and stains are those of `painted`. UserError as pane_before.
+    """
+    pane = pane_before(shots, pane_m, aperture_mm / 1000)
+    first = next(iter(shots.values()))
+    focal = float(np.sqrt(first.k[0, 0] * first.k[1, 1]))
+    on_lens = max(first.size) / 2 / focal * pane_m
+    finer = max(1, round(max(pane.half) / on_lens))  # the raster's pixels stay as small
+    radii = (radius_mm[0] / 1000, radius_mm[1] / 1000)
+    drops = sample_drops(
+        np.random.default_rng([seed, 2]), *pane.half, coverage, radii, resolution=512 * finer
+    )
+    edge = aperture_mm / 1000
+    half = [1.05 * (side - edge) + edge for side in pane.half]
+    return pane, drops, pane_stains(seed, focal, stains, pane_m, half)
+
+
+def painted_pane(
+    photo: Bytes,
+    shot: Shot,
+    pane: Pane,
+    drops: Sequence[Drop],
+    spots: Stains | None,
+    *,
+    aperture_mm: float,
+) -> tuple[Bytes, npt.NDArray[np.float32]]:
+    """A posed photo (H, W, 3) uint8 through a pane in the scene, and its coverage (H, W) in [0, 1]."""
+    cam_from_pane = shot.cam_from_world @ pane.world_from_pane
+    rainy, alpha = paint_pane(
+        photo.astype(np.float32) / np.float32(255), list(drops), cam_from_pane, shot.k,
+        aperture_radius=aperture_mm / 1000, focus_distance=FOCUS_M,
+    )  # fmt: skip
+    return _with_stains(rainy, alpha, spots, shot.k, cam_from_pane, aperture_mm / 1000)

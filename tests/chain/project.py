@@ -87,7 +87,7 @@ def photograph(folder: Path) -> None:
         cams[name] = {"cam_from_world": cam.tolist()}
         _save(folder / f"{name}.png", rainy)
         _save(folder / f"truth/clean/{name}.png", clean)
-        _save(folder / f"truth/coverage/{name}.png", coverage)
+        _save(folder / f"truth/coverage/{name}.png", to_bytes(coverage))
     write_json(folder / "truth/cameras.json", {"frames": cams, "unit": "m"})
 
 

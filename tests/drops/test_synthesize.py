@@ -171,7 +171,7 @@ def test_trajectory_is_a_grid_that_looks_ahead() -> None:
 RECIPE = {
     "mode": "paint", "place": "street", "source": "clean", "seed": 1, "views": 2, "width": 32,
     "height": 24, "field_of_view_deg": 62, "spp": 4, "clean_spp": 4, "coverage": 0.15,
-    "drift_mm": 0.0, "stains": {},
+    "drift_mm": 0.0, "stains": {}, "paint_pane": "lens", "unit_m": 1.0,
     "radius_mm": [3.0, 9.0], "pane_m": 0.12, "aperture_mm": 1.0, "maps": False,
 }  # fmt: skip
 
