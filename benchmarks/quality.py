@@ -57,6 +57,7 @@ FIELD = (
     "resolution",
     "seed",
     "space",
+    "precision",
 )
 
 

@@ -20,7 +20,7 @@ from pipeline.stage import Job, Section, run
 
 SETTINGS = {
     "space", "seed", "resolution", "samples", "levels", "features", "table_log2", "distortion",
-    "trim",
+    "trim", "precision",
 }  # fmt: skip
 
 
@@ -42,6 +42,7 @@ class Params(Section):
     distortion: Annotated[float, Field(ge=0, le=1)]
     trim: Annotated[float, Field(ge=0, le=0.5)]
     rate: Annotated[float, Field(gt=0, le=10)]
+    precision: Literal["auto", "float32", "bfloat16"]
     exposure: bool
     near_factor: Annotated[float, Field(gt=0, le=10)]
     far_factor: Annotated[float, Field(ge=1, le=100)]

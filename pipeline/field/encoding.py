@@ -17,15 +17,21 @@ import torch.nn.functional as F
 from scipy.sparse import csc_array
 from torch import Tensor, nn
 
+from pipeline.field import fused, kernels
+from pipeline.field.sampling import middles
+
 HASH_PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 
 class RowGradient(NamedTuple):
-    """A gradient of a table, not yet added up: rows, their weights and the samples' gradients."""
+    """A gradient of a table, not yet added up: rows, their weights and the samples' gradients.
+
+    Without ``weights`` each sample has one row, ``(N,)``, and the weight 1.
+    """
 
     table: str
     rows: Tensor
-    weights: Tensor
+    weights: Tensor | None
     gradient: Tensor
 
 
@@ -109,6 +115,63 @@ def gather(
     return _Gather.apply(table, rows, weights, name, sink)
 
 
+class _Pick(torch.autograd.Function):
+    """Single rows of a table with one column; the gradient goes into the sink."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, table: Tensor, rows: Tensor, name: str, sink: list[RowGradient] | None
+    ) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.name, ctx.sink, ctx.size = name, sink, table.shape[0]
+        return table.view(-1).index_select(0, rows.view(-1)).view(rows.shape)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        (rows,) = ctx.saved_tensors
+        flat = gradient.contiguous().view(-1)
+        if ctx.sink is None:
+            return add_single(rows.view(-1), flat, ctx.size), None, None, None
+        ctx.sink.append(RowGradient(ctx.name, rows.view(-1), None, flat))
+        return None, None, None, None
+
+
+def pick(
+    table: Tensor, rows: Tensor, name: str = "", sink: list[RowGradient] | None = None
+) -> Tensor:
+    """``table[rows]`` of a table ``(size, 1)``, in the shape of ``rows``; ``sink`` as for gather."""
+    return _Pick.apply(table, rows, name, sink)
+
+
+def add_single(rows: Tensor, gradient: Tensor, size: int) -> Tensor:
+    """``(size, 1)`` with ``gradient`` ``(N,)`` added at ``rows`` ``(N,)``; on a CPU in their order."""
+    out = torch.zeros(size, dtype=gradient.dtype, device=gradient.device)
+    if rows.device.type != "cpu":
+        return out.index_add_(0, rows, gradient)[:, None]
+    kernels.add_single(rows.numpy(), gradient.numpy(), out.numpy())
+    return out[:, None]
+
+
+def nearest_rows(
+    edges: Tensor, along: Tensor | None, shake: Tensor | None, sizes: tuple[int, int, int]
+) -> tuple[Tensor, Tensor]:
+    """Rows ``(R, B)`` int32 of the cells at one point in each interval, and the intervals' lengths.
+
+    ``edges`` ``(3, R, B+1)`` in the unit cube; ``along`` ``(R, B)`` places the points (None: the
+    middles), ``shake`` ``(3, R, B)`` in [0, 1] moves them by up to half a cell.
+    """
+    middle, delta = middles(edges)
+    x = middle
+    if along is not None:
+        x = edges[:, :, :-1] + along * (edges[:, :, 1:] - edges[:, :, :-1])
+    counts = torch.tensor(sizes, dtype=x.dtype, device=x.device)[:, None, None]
+    place = x * counts
+    if shake is not None:
+        place = place + shake - 0.5
+    cell = torch.minimum(place.clamp_min(0.0), counts - 1.0).to(torch.int32)
+    return cell[0] + sizes[0] * (cell[1] + sizes[1] * cell[2]), delta
+
+
 def level_resolutions(
     coarse: tuple[int, int, int], fine: tuple[int, int, int], levels: int
 ) -> list[tuple[int, int, int]]:
@@ -144,10 +207,18 @@ class HashGrid(nn.Module):
             for size in self.sizes
         )
 
-    def forward(self, x: Tensor, prefix: str = "", sink: list[RowGradient] | None = None) -> Tensor:
+    def forward(
+        self,
+        x: Tensor,
+        prefix: str = "",
+        sink: list[RowGradient] | None = None,
+        fast: bool = False,
+    ) -> Tensor:
+        """``sink`` as for :func:`gather`; ``fast``: the corners in one pass, on a CPU."""
         parts = []
+        corners = fused.cell_corners if fast else cell_corners
         for level, table in enumerate(self.tables):
-            rows, weights = cell_corners(x, self.resolutions[level], self.sizes[level])
+            rows, weights = corners(x, self.resolutions[level], self.sizes[level])
             parts.append(gather(table, rows, weights, f"{prefix}tables.{level}", sink))
         return torch.cat(parts, dim=1)
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from pipeline.errors import UserError
 from pipeline.field.base import Field, Part, Rays
 from pipeline.field.buffer import Batch, RayBuffer
-from pipeline.field.encoding import RowGradient, add_rows
+from pipeline.field.encoding import RowGradient, add_rows, add_single
 
 log = logging.getLogger(__name__)
 
@@ -214,12 +214,12 @@ def _total(
     """One parameter's gradient over all shards, added in a fixed order."""
     rows = [entry for _, _, sink in done for entry in sink if entry.table == name]
     if rows:
-        return add_rows(
-            torch.cat([entry.rows for entry in rows]),
-            torch.cat([entry.weights for entry in rows]),
-            torch.cat([entry.gradient for entry in rows]),
-            parameter.shape[0],
-        )
+        places = torch.cat([entry.rows for entry in rows])
+        gradient = torch.cat([entry.gradient for entry in rows])
+        weights = [entry.weights for entry in rows if entry.weights is not None]
+        if not weights:
+            return add_single(places, gradient, parameter.shape[0])
+        return add_rows(places, torch.cat(weights), gradient, parameter.shape[0])
     parts = [gradients[name] for _, gradients, _ in done]
     found = [part for part in parts if part is not None]
     return torch.stack(found).sum(0) if found else None

@@ -7,16 +7,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from pipeline.field import fused
 from pipeline.field.base import Part, Rays, Rendering
 from pipeline.field.encoding import (
     HashGrid,
     RowGradient,
-    gather,
     level_resolutions,
+    nearest_rows,
+    pick,
     spherical_harmonics,
 )
 from pipeline.field.losses import distortion_loss, masked_photometric_loss, proposal_loss
-from pipeline.field.sampling import depth_at, intervals_around, invert_histogram, stratified
+from pipeline.field.sampling import (
+    depth_at,
+    intervals_around,
+    invert_histogram,
+    middles,
+    stratified,
+)
 from pipeline.field.volume import composite, render_weights
 from pipeline.geometry.spaces import Space
 
@@ -39,14 +47,18 @@ class GridConfig:
     proposal: tuple[int, int, int] = (96, 72, 64)
     distortion: float = 0.0
     trim: float = 0.0
+    half: bool = False
 
 
 class GridField(nn.Module):
     """Position to density and features through the grid; features along the ray to colour.
 
     The features are summed along each ray first and the colour network runs once per ray, with the
-    viewing direction, instead of once per sample.
+    viewing direction, instead of once per sample. On a CPU the work along rays is fused
+    (:mod:`pipeline.field.fused`) unless ``plain`` is set: the same within rounding.
     """
+
+    plain = False
 
     def __init__(self, config: GridConfig, space: Space, seed: int) -> None:
         super().__init__()
@@ -58,6 +70,7 @@ class GridField(nn.Module):
         width = config.levels * config.features
         self.shape_in = _linear(width, config.hidden, generator)
         self.shape_out = _linear(config.hidden, SHAPE_OUTPUTS, generator)
+        self.shape_skip = _linear(width, SHAPE_OUTPUTS, generator, bias=False)
         self.colour_in = _linear(SHAPE_OUTPUTS - 1 + 9, config.hidden, generator)
         self.colour_mid = _linear(config.hidden, config.hidden, generator)
         self.colour_out = _linear(config.hidden, 3, generator)
@@ -89,7 +102,8 @@ class GridField(nn.Module):
         if self.config.trim > 0.0 and step >= 200:
             total = masked_photometric_loss(rgb, observed, drop_mask, self.config.trim)
         if learn_proposal:
-            total = total + proposal_loss(out.edges, out.weights, proposed)
+            bound = fused.proposal_loss if self._fused(rays) else proposal_loss
+            total = total + bound(out.edges, out.weights, proposed)
         if self.config.distortion > 0.0:
             total = total + self.config.distortion * distortion_loss(out.edges, out.weights)
         return total, photometric
@@ -115,26 +129,21 @@ class GridField(nn.Module):
     ) -> Tensor:
         """The proposal's weights ``(R, B)`` in equal bins of normalised depth."""
         bins, sizes = self.config.bins, self.config.proposal
-        count = rays.near.shape[0]
-        edges = torch.linspace(0, 1, bins + 1, device=rays.near.device)
-        walk = self._walk(rays, edges.expand(count, -1))
-        step = walk[:, :, 1:] - walk[:, :, :-1]
-        delta = _length(step)
-        if generator is None:
-            x = walk[:, :, :-1] + 0.5 * step
-        else:
-            noise = torch.rand(count, bins, generator=generator, device=delta.device)
-            x = walk[:, :, :-1] + noise * step
-        place = x.reshape(3, -1) * torch.tensor([[float(n)] for n in sizes], device=x.device)
+        count, device = rays.near.shape[0], rays.near.device
+        edges = self._walk(rays, torch.linspace(0, 1, bins + 1, device=device)[None])
+        along = shake = None
         if generator is not None:
+            along = torch.rand(count, bins, generator=generator, device=device)
             # Half a cell of noise: on average the nearest cell is the trilinear mixture.
-            place += torch.rand(place.shape, generator=generator, device=place.device) - 0.5
-        limit = torch.tensor([[n - 1.0] for n in sizes], device=place.device)
-        cell = torch.minimum(place.clamp_(min=0.0), limit).to(torch.int32)
-        row = cell[0] + sizes[0] * (cell[1] + sizes[1] * cell[2])
-        ones = torch.ones_like(place[0])[:, None]
-        raw = gather(self.proposal, row[:, None], ones, "proposal", sink)
-        sigma = torch.exp(raw.view(count, bins).clamp_max(MAX_LOG_DENSITY))
+            shake = torch.rand(3, count, bins, generator=generator, device=device)
+        if self._fused(rays):
+            rows, delta = fused.nearest_rows(edges, along, shake, sizes)
+        else:
+            rows, delta = nearest_rows(edges, along, shake, sizes)
+        raw = pick(self.proposal, rows, "proposal", sink)
+        if self._fused(rays):
+            return fused.weights_of(raw, delta, MAX_LOG_DENSITY)
+        sigma = torch.exp(raw.clamp_max(MAX_LOG_DENSITY))
         return render_weights(sigma, delta, opaque_last=True)
 
     def _shade(
@@ -147,41 +156,63 @@ class GridField(nn.Module):
         """Colours and depths from samples where the proposal has its weight."""
         count, samples = rays.near.shape[0], self.config.samples
         u = stratified(count, samples, generator, rays.near)
-        edges = intervals_around(invert_histogram(proposed + 0.01 / self.config.bins, u))
-        walk = self._walk(rays, edges)
-        delta = _length(walk[:, :, 1:] - walk[:, :, :-1])
-        x = 0.5 * (walk[:, :, 1:] + walk[:, :, :-1])
-        features = self.grid(x.reshape(3, -1), "grid.", sink)
-        shape = self.shape_out(torch.relu(self.shape_in(features))).view(count, samples, -1)
-        sigma = torch.exp(shape[..., 0].clamp_max(MAX_LOG_DENSITY))
-        weights = render_weights(sigma, delta, opaque_last=True)
-        seen = composite(weights, shape)[:, 1:]
+        mixed = proposed + 0.01 / self.config.bins
+        if self._fused(rays):
+            edges = fused.drawn_edges(mixed, u)
+            x, delta = fused.middles(self._walk(rays, edges))
+        else:
+            edges = intervals_around(invert_histogram(mixed, u))
+            x, delta = middles(self._walk(rays, edges))
+        features = self.grid(x.view(3, -1), "grid.", sink, fast=self._fused(rays))
+        shape = self._shape(features, rays).view(count, samples, -1)
+        if self._fused(rays):
+            weights, seen = fused.along_rays(shape, delta, MAX_LOG_DENSITY)
+        else:
+            sigma = torch.exp(shape[..., 0].clamp_max(MAX_LOG_DENSITY))
+            weights = render_weights(sigma, delta, opaque_last=True)
+            seen = composite(weights, shape)[:, 1:]
         hidden = torch.cat([seen, spherical_harmonics(rays.rays_d)], dim=1)
         hidden = torch.relu(self.colour_mid(torch.relu(self.colour_in(hidden))))
-        rgb = torch.sigmoid(self.colour_out(hidden))
+        rgb = torch.sigmoid(self.colour_out(hidden) + seen[:, :3])
         with torch.no_grad():
             middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
             depth = depth_at((weights * middle).sum(-1), rays.near, rays.far)
+            sigma = torch.exp(shape[..., 0].clamp_max(MAX_LOG_DENSITY))
             opacity = 1.0 - torch.exp(-(sigma * delta).sum(-1))
         return Rendering(rgb, depth, opacity, weights, edges)
 
-    def _walk(self, rays: Rays, edges: Tensor) -> Tensor:
-        """Unit-cube positions ``(3, R, K)`` of normalised depths ``(R, K)`` along the rays."""
-        t = depth_at(edges, rays.near[:, None], rays.far[:, None])
+    def _shape(self, features: Tensor, rays: Rays) -> Tensor:
+        """Log density and what the colour is made of, ``(N, 16)``.
+
+        A linear map beside the network: the tables learn through it from the first step.
+        """
+        if self._fused(rays):
+            inner, outer = self.shape_in, self.shape_out
+            return fused.shape_network(
+                features, self.config.half, inner.weight, inner.bias, outer.weight, outer.bias,
+                self.shape_skip.weight,
+            )  # fmt: skip
+        hidden = torch.relu(self.shape_in(features))
+        return self.shape_out(hidden) + self.shape_skip(features)
+
+    def _fused(self, rays: Rays) -> bool:
+        return rays.near.device.type == "cpu" and not self.plain
+
+    def _walk(self, rays: Rays, s: Tensor) -> Tensor:
+        """Unit-cube positions ``(3, R, K)`` of normalised depths ``(R or 1, K)`` along the rays."""
+        if self._fused(rays):
+            return fused.walk(self.space, *rays, s)
+        t = depth_at(s, rays.near[:, None], rays.far[:, None])
         return self.space.warp(rays.rays_o[:, :, None] + rays.rays_d[:, :, None] * t)
 
 
-def _length(steps: Tensor) -> Tensor:
-    # Ten times faster than torch.linalg.vector_norm over the first axis.
-    return (steps[0].square() + steps[1].square() + steps[2].square()).sqrt()
-
-
-def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
+def _linear(inputs: int, outputs: int, generator: torch.Generator, bias: bool = True) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs, bias)
     with torch.no_grad():
         bound = (6.0 / inputs) ** 0.5
         layer.weight.uniform_(-bound, bound, generator=generator)
-        layer.bias.zero_()
+        if bias:
+            layer.bias.zero_()
     return layer
 
 

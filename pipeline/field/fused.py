@@ -1,0 +1,203 @@
+"""The fast field's inner work on a CPU, fused: the same numbers as the tensor operations that it replaces.
+
+Each function here has its twin in plain tensor operations, which any device runs (sampling.py, volume.py,
+losses.py, encoding.py); the tests hold the two to each other.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.field import kernels
+from pipeline.geometry.spaces import Space
+
+NOTHING = np.empty((0, 0), np.float32)
+NO_SHAKE = np.empty((0, 0, 0), np.float32)
+
+
+def walk(
+    space: Space, rays_o: Tensor, rays_d: Tensor, near: Tensor, far: Tensor, s: Tensor
+) -> Tensor:
+    """Unit-cube positions ``(3, R, K)`` of normalised depths ``s`` ``(R, K)`` or ``(1, K)``."""
+    matrix = torch.tensor(space.ref_from_world, dtype=torch.float32)
+    o = torch.addmm(matrix[:, 3:], matrix[:, :3], rays_o)
+    d = matrix[:, :3] @ rays_d
+    low = np.array(space.low, np.float32)
+    scale = np.array(
+        [1.0 / (b - a) for a, b in zip(space.low, space.high, strict=True)], np.float32
+    )
+    out = torch.empty(3, o.shape[1], s.shape[1])
+    kernels.walk(
+        o.numpy(), d.numpy(), near.numpy(), far.numpy(), s.numpy(),
+        space.kind == "ndc", np.float32(space.near), low, scale, out.numpy(),
+    )  # fmt: skip
+    return out
+
+
+def nearest_rows(
+    edges: Tensor, along: Tensor | None, shake: Tensor | None, sizes: tuple[int, int, int]
+) -> tuple[Tensor, Tensor]:
+    """Proposal rows ``(R, B)`` int32 of one point in each interval, and the intervals' lengths.
+
+    ``edges`` ``(3, R, B+1)`` in the unit cube; ``along`` ``(R, B)`` places the points (None: the
+    middles), ``shake`` ``(3, R, B)`` in [0, 1] moves them by up to half a cell.
+    """
+    rows = torch.empty(edges.shape[1], edges.shape[2] - 1, dtype=torch.int32)
+    delta = torch.empty(rows.shape)
+    kernels.nearest_rows(
+        edges.numpy(),
+        NOTHING if along is None else along.numpy(),
+        NO_SHAKE if shake is None else shake.numpy(),
+        np.array(sizes, np.int32), rows.numpy(), delta.numpy(),
+    )  # fmt: skip
+    return rows, delta
+
+
+def drawn_edges(weights: Tensor, u: Tensor) -> Tensor:
+    """``intervals_around(invert_histogram(weights, u))`` of sampling.py."""
+    edges = torch.empty(u.shape[0], u.shape[1] + 1)
+    kernels.draw(weights.contiguous().numpy(), u.contiguous().numpy(), edges.numpy())
+    return edges
+
+
+def middles(edges: Tensor) -> tuple[Tensor, Tensor]:
+    """Middles ``(3, R, S)`` and lengths ``(R, S)`` of the pieces between ``edges`` ``(3, R, S+1)``."""
+    x = torch.empty(3, edges.shape[1], edges.shape[2] - 1)
+    delta = torch.empty(x.shape[1:])
+    kernels.middles(edges.numpy(), x.numpy(), delta.numpy())
+    return x, delta
+
+
+def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tuple[Tensor, Tensor]:
+    """As :func:`pipeline.field.encoding.cell_corners`."""
+    rows = torch.empty(x.shape[1], 8, dtype=torch.int32)
+    shares = torch.empty(x.shape[1], 8)
+    sizes, dense = np.array(resolution, np.int32), math.prod(resolution) <= size
+    kernels.corners(x.numpy(), sizes, dense, np.int32(size - 1), rows.numpy(), shares.numpy())
+    return rows, shares
+
+
+def _absorbed(raw: Tensor, delta: Tensor, limit: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Optical depth of each interval, what is left behind it, and the weights; the last is opaque."""
+    tau = torch.exp(raw.clamp_max(limit)).mul_(delta)
+    left = torch.exp(-torch.cumsum(tau, dim=-1))
+    left[:, -1] = 0.0
+    weights = torch.empty_like(left)
+    weights[:, 0] = 1.0 - left[:, 0]
+    torch.sub(left[:, :-1], left[:, 1:], out=weights[:, 1:])
+    # The gradient of a density at its limit is nothing.
+    tau.masked_fill_(raw > limit, 0.0)
+    return tau, left, weights
+
+
+class _Weights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, delta: Tensor, limit: float) -> Tensor:
+        tau, left, weights = _absorbed(raw, delta, limit)
+        ctx.save_for_backward(tau, left, weights)
+        return weights
+
+    @staticmethod
+    def backward(ctx: Any, g_weights: Tensor) -> Any:
+        tau, left, weights = ctx.saved_tensors
+        out = torch.empty_like(weights)
+        kernels.weights_back(
+            weights.numpy(), left.numpy(), tau.numpy(), g_weights.contiguous().numpy(), out.numpy()
+        )
+        return out, None, None
+
+
+def weights_of(raw: Tensor, delta: Tensor, limit: float) -> Tensor:
+    """``render_weights(exp(raw), delta, opaque_last=True)`` with ``raw`` at most ``limit``."""
+    out: Tensor = _Weights.apply(raw, delta, limit)
+    return out
+
+
+class _Along(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, shape: Tensor, delta: Tensor, limit: float) -> Any:
+        tau, left, weights = _absorbed(shape[..., 0].contiguous(), delta, limit)
+        seen = torch.empty(shape.shape[0], shape.shape[2] - 1)
+        kernels.seen(weights.numpy(), shape.numpy(), seen.numpy())
+        ctx.save_for_backward(tau, left, weights, shape)
+        ctx.set_materialize_grads(False)
+        return weights, seen
+
+    @staticmethod
+    def backward(ctx: Any, g_weights: Tensor | None, g_seen: Tensor | None) -> Any:
+        tau, left, weights, shape = ctx.saved_tensors
+        out = torch.empty_like(shape)
+        if g_seen is None:
+            g_seen = torch.zeros(shape.shape[0], shape.shape[2] - 1)
+        kernels.seen_back(
+            weights.numpy(), left.numpy(), tau.numpy(), shape.numpy(), g_seen.contiguous().numpy(),
+            NOTHING if g_weights is None else g_weights.contiguous().numpy(), out.numpy(),
+        )  # fmt: skip
+        return out, None, None
+
+
+def along_rays(shape: Tensor, delta: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """The weights ``(R, S)`` of samples and their weighted features ``(R, C-1)``.
+
+    ``shape`` ``(R, S, C)``: log density first (at most ``limit``), then features; ``delta`` ``(R, S)``.
+    """
+    weights, seen = _Along.apply(shape, delta, limit)
+    return weights, seen
+
+
+class _OuterBound(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, proposed: Tensor, edges: Tensor, weights: Tensor, eps: float) -> Tensor:
+        gradient = torch.empty_like(proposed)
+        total = kernels.outer_bound(
+            edges.numpy(), weights.numpy(), proposed.numpy(), np.float32(eps), gradient.numpy()
+        )
+        ctx.save_for_backward(gradient)
+        return torch.tensor(total / proposed.shape[0], dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> Any:
+        (gradient,) = ctx.saved_tensors
+        return gradient * (g / gradient.shape[0]), None, None, None
+
+
+def proposal_loss(edges: Tensor, weights: Tensor, proposed: Tensor, eps: float = 1e-7) -> Tensor:
+    """As :func:`pipeline.field.losses.proposal_loss`."""
+    out: Tensor = _OuterBound.apply(proposed.contiguous(), edges, weights.detach(), eps)
+    return out
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, half: bool, *weights: Tensor) -> Tensor:
+        kind = torch.bfloat16 if half else x.dtype
+        x, w_in, b_in, w_out, b_out, w_skip = (part.to(kind) for part in (x, *weights))
+        hidden = torch.addmm(b_in, x, w_in.t()).relu_()
+        ctx.save_for_backward(x, hidden, w_in, w_out, w_skip)
+        return torch.addmm(b_out, hidden, w_out.t()).addmm_(x, w_skip.t()).float()
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> Any:
+        x, hidden, w_in, w_out, w_skip = ctx.saved_tensors
+        low = g.to(x.dtype)
+        g_hidden = torch.ops.aten.threshold_backward(low @ w_out, hidden, 0)
+        g_x = (g_hidden @ w_in).addmm_(low, w_skip)
+        g_in, g_out, g_skip = g_hidden.t() @ x, low.t() @ hidden, low.t() @ x
+        sums = g_hidden.sum(0, dtype=torch.float32), g.sum(0)
+        return g_x.float(), None, g_in.float(), sums[0], g_out.float(), sums[1], g_skip.float()
+
+
+def shape_network(x: Tensor, half: bool, *weights: Tensor) -> Tensor:
+    """One hidden layer beside a linear map: ``(N, C)`` from ``x`` ``(N, F)``.
+
+    ``weights``: hidden layer and bias, output layer and bias, and the linear map's weights. With
+    ``half`` the products are those of bfloat16 numbers, which newer processors multiply several
+    times faster.
+    """
+    out: Tensor = _Network.apply(x, half, *weights)
+    return out

@@ -1,0 +1,257 @@
+"""Loops over rays and table rows, compiled by numba: the fast field's inner work on a CPU.
+
+Each does in one pass what takes many tensor operations, lets other threads run meanwhile, and works in a
+fixed order: the same bytes every time. Arrays in, arrays filled; shapes as the callers in
+:mod:`pipeline.field.fused` make them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from pipeline.geometry.spaces import EPS
+
+# Reordering sums lets them run in vectors; infinities and NaN must survive, or a broken fit goes unseen.
+_FLAGS = {"contract", "reassoc", "nsz", "arcp"}
+compiled: Any = numba.njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
+inlined: Any = numba.njit(
+    nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy", inline="always"
+)
+P1, P2 = np.int32(2654435761 - 2**32), np.int32(805459861)
+
+
+@inlined
+def _warped(ndc, x, y, z, near, low, scale, axis):  # type: ignore[no-untyped-def]
+    """One unit-cube coordinate of a point in the space's own frame."""
+    if ndc:
+        inverse = np.float32(1.0) / max(z, np.float32(EPS))
+        mapped = np.float32(1.0) - near * inverse
+        if axis == 0:
+            mapped = x * inverse
+        elif axis == 1:
+            mapped = y * inverse
+    else:
+        norm = max(np.sqrt(x * x + y * y + z * z), np.float32(1.0))
+        factor = (np.float32(2.0) - np.float32(1.0) / norm) / norm
+        mapped = z * factor
+        if axis == 0:
+            mapped = x * factor
+        elif axis == 1:
+            mapped = y * factor
+    return min(max((mapped - low[axis]) * scale[axis], np.float32(0.0)), np.float32(1.0))
+
+
+@compiled
+def walk(o, d, near, far, s, ndc, space_near, low, scale, out):  # type: ignore[no-untyped-def]
+    """Fills ``out`` (3, R, K) with unit-cube positions at normalised depths ``s`` (R or 1, K).
+
+    ``o`` and ``d`` (3, R) are rays in the space's own frame.
+    """
+    rays, count = out.shape[1], out.shape[2]
+    one = np.float32(1.0)
+    for r in range(rays):
+        row = r if s.shape[0] > 1 else 0
+        first = one / near[r]
+        slope = one / far[r] - first
+        ox, oy, oz, dx, dy, dz = o[0, r], o[1, r], o[2, r], d[0, r], d[1, r], d[2, r]
+        for k in range(count):
+            t = one / (first + s[row, k] * slope)
+            x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+            out[0, r, k] = _warped(ndc, x, y, z, space_near, low, scale, 0)
+            out[1, r, k] = _warped(ndc, x, y, z, space_near, low, scale, 1)
+            out[2, r, k] = _warped(ndc, x, y, z, space_near, low, scale, 2)
+
+
+@compiled
+def nearest_rows(edges, along, shake, sizes, rows, delta):  # type: ignore[no-untyped-def]
+    """Fills ``rows`` (R, B) of the cells between ``edges`` (3, R, B+1) and the lengths ``delta``.
+
+    ``along`` (R, B) in [0, 1] places a point in each interval, ``shake`` (3, R, B) moves it by as
+    many cells less a half; both may be empty: the middle, unmoved.
+    """
+    rays, bins = rows.shape
+    half, zero = np.float32(0.5), np.float32(0.0)
+    random = along.size > 0
+    nx, ny, nz = np.float32(sizes[0]), np.float32(sizes[1]), np.float32(sizes[2])
+    for r in range(rays):
+        for b in range(bins):
+            x0, y0, z0 = edges[0, r, b], edges[1, r, b], edges[2, r, b]
+            sx, sy, sz = edges[0, r, b + 1] - x0, edges[1, r, b + 1] - y0, edges[2, r, b + 1] - z0
+            delta[r, b] = np.sqrt(sx * sx + sy * sy + sz * sz)
+            share = along[r, b] if random else half
+            x, y, z = (x0 + share * sx) * nx, (y0 + share * sy) * ny, (z0 + share * sz) * nz
+            if random:
+                x += shake[0, r, b] - half
+                y += shake[1, r, b] - half
+                z += shake[2, r, b] - half
+            i = np.int32(min(max(x, zero), nx - np.float32(1.0)))
+            j = np.int32(min(max(y, zero), ny - np.float32(1.0)))
+            k = np.int32(min(max(z, zero), nz - np.float32(1.0)))
+            rows[r, b] = i + sizes[0] * (j + sizes[1] * k)
+
+
+@compiled
+def add_single(rows, gradient, out):  # type: ignore[no-untyped-def]
+    """Adds ``gradient`` (N,) into ``out`` at ``rows`` (N,)."""
+    for n in range(rows.shape[0]):
+        out[rows[n]] += gradient[n]
+
+
+@compiled
+def draw(weights, u, edges):  # type: ignore[no-untyped-def]
+    """Fills ``edges`` (R, S+1) of intervals around the places whose cumulative weight is ``u`` (R, S).
+
+    As ``intervals_around(invert_histogram(weights, u))``; ``weights`` (R, B).
+    """
+    rays, bins = weights.shape
+    samples = u.shape[1]
+    places = np.empty(samples, np.float32)
+    small, one, half = np.float32(1e-6), np.float32(1.0), np.float32(0.5)
+    for r in range(rays):
+        total = np.float32(0.0)
+        for b in range(bins):
+            total += weights[r, b] + small
+        b, lower, upper = 0, np.float32(0.0), (weights[r, 0] + small) / total
+        for k in range(samples):
+            while upper < u[r, k] and b < bins - 1:
+                b += 1
+                lower = upper
+                upper = lower + (weights[r, b] + small) / total
+            inside = (u[r, k] - lower) / max(upper - lower, np.float32(1e-12))
+            places[k] = (b + min(max(inside, np.float32(0.0)), one)) / np.float32(bins)
+        last = samples - 1
+        for k in range(last):
+            edges[r, k + 1] = half * (places[k] + places[k + 1])
+        edges[r, 0] = max(places[0] + places[0] - edges[r, 1], np.float32(0.0))
+        edges[r, samples] = min(places[last] + places[last] - edges[r, last], one)
+
+
+@compiled
+def middles(edges, x, delta):  # type: ignore[no-untyped-def]
+    """Fills ``x`` (3, R, S), the middles between ``edges`` (3, R, S+1), and lengths ``delta`` (R, S)."""
+    rays, samples = delta.shape
+    half = np.float32(0.5)
+    for r in range(rays):
+        for k in range(samples):
+            total = np.float32(0.0)
+            for c in range(3):
+                a, b = edges[c, r, k], edges[c, r, k + 1]
+                x[c, r, k] = half * (a + b)
+                total += (b - a) * (b - a)
+            delta[r, k] = np.sqrt(total)
+
+
+@compiled
+def seen(weights, shape, out):  # type: ignore[no-untyped-def]
+    """Fills ``out`` (R, C-1) with the sum over samples of ``weights`` (R, S) times ``shape[..., 1:]``."""
+    rays, samples = weights.shape
+    width = out.shape[1]
+    for r in range(rays):
+        for c in range(width):
+            out[r, c] = np.float32(0.0)
+        for k in range(samples):
+            w = weights[r, k]
+            for c in range(width):
+                out[r, c] += w * shape[r, k, c + 1]
+
+
+@compiled
+def seen_back(weights, left, tau, shape, g_seen, g_weights, out):  # type: ignore[no-untyped-def]
+    """Fills ``out`` (R, S, C), the gradient of ``shape``, whose first channel is the log density.
+
+    ``left`` (R, S) is the transmittance behind each interval, ``tau`` (R, S) density times length,
+    0 where the density is at its limit; the last interval is opaque. ``g_weights`` may be empty.
+    """
+    rays, samples = weights.shape
+    width = g_seen.shape[1]
+    zero = np.float32(0.0)
+    for r in range(rays):
+        behind = zero
+        for j in range(samples):
+            k = samples - 1 - j
+            w, g = weights[r, k], zero
+            for c in range(width):
+                g += g_seen[r, c] * shape[r, k, c + 1]
+                out[r, k, c + 1] = w * g_seen[r, c]
+            if g_weights.size > 0:
+                g += g_weights[r, k]
+            out[r, k, 0] = zero if j == 0 else (g * left[r, k] - behind) * tau[r, k]
+            behind += g * w
+
+
+@compiled
+def weights_back(weights, left, tau, g_weights, out):  # type: ignore[no-untyped-def]
+    """Fills ``out`` (R, B), the gradient of the log density, from that of the weights; as seen_back."""
+    rays, bins = weights.shape
+    for r in range(rays):
+        behind = np.float32(0.0)
+        for j in range(bins):
+            k = bins - 1 - j
+            g = g_weights[r, k]
+            out[r, k] = np.float32(0.0) if j == 0 else (g * left[r, k] - behind) * tau[r, k]
+            behind += g * weights[r, k]
+
+
+@compiled
+def outer_bound(edges, weights, proposed, eps, gradient):  # type: ignore[no-untyped-def]
+    """The sum over rays of the proposal's loss; fills ``gradient`` (R, B) of that sum."""
+    rays, samples = weights.shape
+    bins = proposed.shape[1]
+    loss = 0.0
+    for r in range(rays):
+        for b in range(bins):
+            gradient[r, b] = np.float32(0.0)
+        for k in range(samples):
+            first = max(0, int(np.floor(edges[r, k] * np.float32(bins))))
+            last = min(bins, int(np.ceil(edges[r, k + 1] * np.float32(bins))))
+            bound = np.float32(0.0)
+            for b in range(first, last):
+                bound += proposed[r, b]
+            w = weights[r, k]
+            excess = w - bound
+            if not excess <= np.float32(0.0):
+                loss += excess * excess / (w + eps)
+                slope = np.float32(-2.0) * excess / (w + eps)
+                for b in range(first, last):
+                    gradient[r, b] += slope
+    return loss
+
+
+@compiled
+def corners(x, sizes, dense, last_row, rows, shares):  # type: ignore[no-untyped-def]
+    """Fills ``rows`` and ``shares`` (N, 8): table rows around points ``x`` (3, N), trilinear weights.
+
+    ``sizes`` (3,) int32 vertices per axis; ``last_row`` of a table of a power of two rows.
+    """
+    one = np.float32(1.0)
+    lx, ly, lz = np.float32(sizes[0] - 1), np.float32(sizes[1] - 1), np.float32(sizes[2] - 1)
+    sy = np.int32(sizes[0]) if dense else P1
+    sz = np.int32(sizes[0] * sizes[1]) if dense else P2
+    zero = np.int32(0)  # rows stay within the table even where a broken fit asks for NaN
+    for n in range(x.shape[1]):
+        px, py, pz = x[0, n] * lx, x[1, n] * ly, x[2, n] * lz
+        i = max(min(np.int32(px), np.int32(sizes[0] - 2)), zero)
+        j = max(min(np.int32(py), np.int32(sizes[1] - 2)), zero)
+        k = max(min(np.int32(pz), np.int32(sizes[2] - 2)), zero)
+        fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
+        gx, gy, gz = one - fx, one - fy, one - fz
+        i1, j0, k0 = np.int32(i + 1), np.int32(j * sy), np.int32(k * sz)
+        j1, k1 = np.int32(j0 + sy), np.int32(k0 + sz)
+        a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
+        shares[n, 0], shares[n, 1] = a * gz, a * fz
+        shares[n, 2], shares[n, 3] = b * gz, b * fz
+        shares[n, 4], shares[n, 5] = c * gz, c * fz
+        shares[n, 6], shares[n, 7] = d * gz, d * fz
+        if dense:
+            rows[n, 0], rows[n, 1] = i + j0 + k0, i + j0 + k1
+            rows[n, 2], rows[n, 3] = i + j1 + k0, i + j1 + k1
+            rows[n, 4], rows[n, 5] = i1 + j0 + k0, i1 + j0 + k1
+            rows[n, 6], rows[n, 7] = i1 + j1 + k0, i1 + j1 + k1
+        else:
+            rows[n, 0], rows[n, 1] = (i ^ j0 ^ k0) & last_row, (i ^ j0 ^ k1) & last_row
+            rows[n, 2], rows[n, 3] = (i ^ j1 ^ k0) & last_row, (i ^ j1 ^ k1) & last_row
+            rows[n, 4], rows[n, 5] = (i1 ^ j0 ^ k0) & last_row, (i1 ^ j0 ^ k1) & last_row
+            rows[n, 6], rows[n, 7] = (i1 ^ j1 ^ k0) & last_row, (i1 ^ j1 ^ k1) & last_row

@@ -1,0 +1,189 @@
+"""The fused work on a CPU gives the numbers, and the gradients, of the plain tensor operations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from pipeline.field import encoding, fused, losses, sampling
+from pipeline.field.base import Rays
+from pipeline.field.encoding import RowGradient, add_rows, add_single
+from pipeline.field.grid_field import GridConfig, GridField
+from pipeline.field.volume import composite, render_weights
+from pipeline.geometry.spaces import Space
+
+R, B, S = 60, 16, 7
+NDC = Space("ndc", ((1, 0, 0, 0.1), (0, 1, 0, 0), (0, 0, 1, 0.2)), 2.0, (-1, -1, 0), (1, 1, 0.9))
+BALL = Space(
+    "contract", ((0.5, 0, 0, 0), (0, 0, 0.5, 0), (0, -0.5, 0, 0)), 1.0, (-2,) * 3, (2,) * 3
+)
+SMALL = GridConfig(
+    levels=2, features=4, table_log2=10, coarse=(6, 5, 4), fine=(24, 18, 16), hidden=16, samples=S,
+    bins=B, proposal=(12, 9, 8),
+)  # fmt: skip
+
+
+def source(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def some_rays() -> Rays:
+    g = source(5)
+    rays_d = torch.rand(3, R, generator=g) - 0.5
+    rays_d[2] = 1.0
+    near = 2.0 + torch.rand(R, generator=g)
+    return Rays(0.2 * torch.rand(3, R, generator=g), rays_d, near, near * 8.0)
+
+
+def both(work: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """The result and the gradient of a fixed mixture of it."""
+    x = x.clone().requires_grad_()
+    out = work(x)
+    mixture = torch.rand(out.shape, generator=source(9))
+    return out.detach(), torch.autograd.grad((out * mixture).sum(), x)[0]
+
+
+@pytest.mark.parametrize("space", [NDC, BALL])
+@pytest.mark.parametrize("rows", [1, R])
+def test_positions_along_rays(space: Space, rows: int) -> None:
+    rays = some_rays()
+    s = torch.sort(torch.rand(rows, S, generator=source())).values
+    t = sampling.depth_at(s, rays.near[:, None], rays.far[:, None])
+    plain = space.warp(rays.rays_o[:, :, None] + rays.rays_d[:, :, None] * t)
+    found = fused.walk(space, *rays, s)
+    torch.testing.assert_close(found, plain, atol=2e-6, rtol=0)
+    assert float(found.std()) > 0.05
+
+
+@pytest.mark.parametrize("size", [4096, 64])
+def test_corners_are_those_of_the_grid(size: int) -> None:
+    x = torch.rand(3, 500, generator=source())
+    x[:, :3] = torch.tensor([0.0, 1.0, 0.5])
+    rows, shares = fused.cell_corners(x, (17, 9, 12), size)
+    expected, weights = encoding.cell_corners(x, (17, 9, 12), size)
+    assert torch.equal(rows, expected)
+    torch.testing.assert_close(shares, weights, atol=1e-5, rtol=0)
+
+
+def test_rows_stay_in_the_table_when_a_broken_fit_asks_for_nan() -> None:
+    rows, _ = fused.cell_corners(torch.full((3, 4), float("nan")), (17, 9, 12), 64)
+    assert int(rows.min()) >= 0 and int(rows.max()) < 64
+
+
+@pytest.mark.parametrize("random", [True, False])
+def test_rows_of_the_proposal(random: bool) -> None:
+    edges = torch.sort(torch.rand(3, R, B + 1, generator=source())).values
+    along = torch.rand(R, B, generator=source(1)) if random else None
+    shake = torch.rand(3, R, B, generator=source(2)) if random else None
+    rows, delta = fused.nearest_rows(edges, along, shake, (12, 9, 8))
+    expected, lengths = encoding.nearest_rows(edges, along, shake, (12, 9, 8))
+    # A point on the border between two cells may fall to either side by rounding.
+    assert int((rows != expected).sum()) <= 2
+    torch.testing.assert_close(delta, lengths)
+
+
+def test_edges_drawn_from_a_histogram() -> None:
+    weights = torch.rand(R, B, generator=source()) ** 4
+    weights[0] = 0.0
+    weights[1, :-1] = 0.0
+    u = sampling.stratified(R, S, source(1), weights)
+    plain = sampling.intervals_around(sampling.invert_histogram(weights, u))
+    torch.testing.assert_close(fused.drawn_edges(weights, u), plain, atol=2e-5, rtol=0)
+    x, delta = fused.middles(torch.stack([plain, 2 * plain, 0 * plain]))
+    expected = 0.5 * (plain[:, 1:] + plain[:, :-1])
+    torch.testing.assert_close(x, torch.stack([expected, 2 * expected, 0 * expected]))
+    torch.testing.assert_close(delta, 5**0.5 * (plain[:, 1:] - plain[:, :-1]))
+
+
+def test_weights_and_features_along_rays() -> None:
+    shape = torch.randn(R, S, 5, generator=source())
+    shape[0, 2, 0] = 20.0  # at the limit: no gradient
+    delta = torch.rand(R, S, generator=source(1))
+
+    def plain(shape: Tensor) -> Tensor:
+        sigma = torch.exp(shape[..., 0].clamp_max(12.0))
+        weights = render_weights(sigma, delta, opaque_last=True)
+        return torch.cat([weights, composite(weights, shape)[:, 1:]], 1)
+
+    def quick(shape: Tensor) -> Tensor:
+        return torch.cat(fused.along_rays(shape, delta, 12.0), 1)
+
+    for one, other in zip(both(plain, shape), both(quick, shape), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+    for one, other in zip(
+        both(lambda raw: plain(raw[..., None])[:, :S], shape[..., 0]),
+        both(lambda raw: fused.weights_of(raw, delta, 12.0), shape[..., 0]),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
+def test_the_loss_of_the_proposal() -> None:
+    edges = torch.sort(torch.rand(R, S + 1, generator=source())).values
+    weights = torch.rand(R, S, generator=source(1)) / S
+    proposed = torch.rand(R, B, generator=source(2)) / B
+    for one, other in zip(
+        both(lambda p: losses.proposal_loss(edges, weights, p), proposed),
+        both(lambda p: fused.proposal_loss(edges, weights, p), proposed),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("half", "close"), [(False, 1e-5), (True, 3e-2)])
+def test_the_shape_network(half: bool, close: float) -> None:
+    g = source()
+    x = torch.randn(200, 6, generator=g)
+    sizes = ((8, 6), (8,), (4, 8), (4,), (4, 6))
+    weights = [torch.randn(size, generator=g) for size in sizes]
+
+    def plain(x: Tensor, weights: list[Tensor]) -> Tensor:
+        inner, inner_bias, outer, outer_bias, skip = weights
+        hidden = torch.relu(x @ inner.t() + inner_bias)
+        return hidden @ outer.t() + outer_bias + x @ skip.t()
+
+    def gradients(work: Callable[..., Tensor]) -> list[Tensor]:
+        leaves = [part.clone().requires_grad_() for part in (x, *weights)]
+        out = work(leaves[0], leaves[1:])
+        return [out.detach(), *torch.autograd.grad(out.square().sum(), leaves)]
+
+    expected = gradients(plain)
+    found = gradients(lambda x, weights: fused.shape_network(x, half, *weights))
+    for one, other in zip(expected, found, strict=True):
+        assert one.dtype == other.dtype == torch.float32
+        assert float((one - other).norm() / one.norm()) < close
+
+
+@pytest.mark.parametrize("space", [NDC, BALL])
+def test_a_whole_step(space: Space) -> None:
+    rays = some_rays()
+    observed, none = torch.rand(R, 3, generator=source(3)), torch.zeros(R)
+    results = []
+    for plain in (True, False):
+        field = GridField(replace(SMALL, distortion=0.1), space, 0)
+        field.plain = plain
+        sink: list[RowGradient] = []
+        loss, _ = field.loss(rays, observed, none, 0, source(4), sink)
+        named = dict(field.named_parameters())
+        found = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
+        gradients = {n: g for n, g in zip(named, found, strict=True) if g is not None}
+        for entry in sink:
+            size = named[entry.table].shape[0]
+            gradients[entry.table] = (
+                add_single(entry.rows, entry.gradient, size)
+                if entry.weights is None
+                else add_rows(entry.rows, entry.weights, entry.gradient, size)
+            )
+        results.append((loss.detach(), gradients, field.render(rays)))
+    (loss, gradients, view), (same_loss, same_gradients, same_view) = results
+    torch.testing.assert_close(loss, same_loss)
+    assert set(gradients) == set(same_gradients) == set(named)
+    for name, gradient in gradients.items():
+        off = (gradient - same_gradients[name]).norm() / gradient.norm()
+        assert float(off) < 1e-2, name  # a unit near zero may be on in one and off in the other
+    for one, other in zip(view, same_view, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
