@@ -1,13 +1,15 @@
 """Poses under rain: how many photos are placed, and how far off, with and without masks.
 
     python -m experiments.poses.measure --demo data/demo --photos PATH [--scenes DIR ...] --out DIR
+    python -m experiments.poses.measure --scenes DIR ... --artifacts DIR --ways plain --out DIR
 
 Every capture is solved in several ways: `plain` (no masks, every match counts),
 `filter` (no masks, matches that stay at their pixel are dropped), `detected` (masks of the shipped
 detector, where the scene has been through `masks`), `true` (masks from the true coverage), each in
 one attempt; and `retried`, true masks with the further attempts that the stage makes.
-`--demo` and `--scenes` are folders that `synthesize` made; the demo's clean views are also wetted
-with heavy drops, the same in all. `--photos` are dry photos without truth: poses of the dry ones
+`--demo` and `--scenes` are folders that `synthesize` made, solved wet and dry; the demo's clean views
+are also wetted with heavy drops, the same in all. `--ways` solves in these alone. `--artifacts` adds
+what the stages made of the scenes, `stage`: DIR/<scene>/poses is compared with the truth. `--photos` are dry photos without truth: poses of the dry ones
 stand for it. Results go to DIR/<case>-<way>.json, one at a time; what is there is not done again.
 """
 
@@ -30,6 +32,7 @@ from pipeline.io.atomic import write_json
 from pipeline.io.images import read_image, write_image
 from pipeline.io.masks import read_keep_mask, write_keep_mask
 from pipeline.io.photos import convert, examine, final_size, list_photos, plan_sizes
+from pipeline.io.transforms import read_transforms
 from pipeline.sfm import Settings, reconstruct
 
 LONGEST = 800
@@ -98,6 +101,13 @@ def _made_scene(folder: Path, out: Path) -> Case:
     return Case(folder.name, images, masks, {}, _true_poses(folder / "truth/cameras.json"))
 
 
+def _dried(folder: Path, case: Case, out: Path) -> Case:
+    """The clean views of a scene."""
+    images = out / "cases" / f"{folder.name}-dry" / "images"
+    _brought_in(folder / "truth/clean", images)
+    return Case(f"{folder.name}-dry", images, {}, {}, case.truth)
+
+
 def _wetted(case: Case, coverage: float, seed: int = 5) -> Case:
     """The images of `case` seen through one wet pane at the lens."""
     name = f"{case.name}-{round(100 * coverage)}%"
@@ -163,17 +173,31 @@ def _against(poses: Poses, truth: Poses | None) -> dict[str, float]:
     }
 
 
+def _by_the_stage(scene: Path, poses: Path) -> tuple[dict[str, object], Poses]:
+    """The row of what the stage `poses` left for a scene."""
+    told = json.loads((poses / "poses.json").read_text())
+    found = {
+        n: view.cam_from_world for n, view in read_transforms(poses / "transforms.json").items()
+    }
+    kept = [read_keep_mask(poses.parent / "masks" / name).mean() for name in sorted(found)]
+    return {
+        "case": scene.name, "way": "stage", "total": told["total"], "registered": len(found),
+        "masked": round(1 - float(np.mean(kept)), 4), "points": told["points"],
+        "reprojection_px": round(told["reprojection_px"], 4), "focal_px": told["focal_px"],
+    }, found  # fmt: skip
+
+
 def _cases(demo: Path | None, scenes: list[Path], photos: Path | None, out: Path) -> Iterator[Case]:
     if demo is not None:
         case = _made_scene(demo, out)
         yield case
-        dry = out / "cases" / f"{demo.name}-dry" / "images"
-        _brought_in(demo / "truth/clean", dry)
-        clean = Case(f"{demo.name}-dry", dry, {}, {}, case.truth)
+        clean = _dried(demo, case, out)
         yield clean
         yield from (_wetted(clean, coverage) for coverage in HEAVY)
     for folder in scenes:
-        yield _made_scene(folder, out)
+        case = _made_scene(folder, out)
+        yield case
+        yield _dried(folder, case, out)
     if photos is not None:
         dry = out / "cases" / photos.parent.name / "images"
         focal = _brought_in(photos, dry)
@@ -187,7 +211,7 @@ def _cases(demo: Path | None, scenes: list[Path], photos: Path | None, out: Path
 def table(out: Path) -> str:
     """A Markdown table of all results in `out`."""
     rows = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
-    order = {way: index for index, way in enumerate(WAYS)}
+    order = {way: index for index, way in enumerate([*WAYS, "stage"])}
     lines = [
         "| capture | way | masked | placed | points | error, px | turn, ° (largest) | place, % (largest) |",
         "|---|---|---|---|---|---|---|---|",
@@ -203,6 +227,12 @@ def table(out: Path) -> str:
     return "\n".join(lines)
 
 
+def _keep(file: Path, row: dict[str, object], poses: Poses, truth: Poses | None) -> None:
+    row |= _against(poses, truth)
+    write_json(file, row | {"poses": {name: pose.tolist() for name, pose in poses.items()}})
+    print(json.dumps(row), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -210,6 +240,8 @@ def main() -> None:
     parser.add_argument("--demo", type=Path)
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])
     parser.add_argument("--photos", type=Path)
+    parser.add_argument("--artifacts", type=Path)
+    parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS))
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--table", action="store_true", help="only print what DIR holds")
     flags = parser.parse_args()
@@ -217,15 +249,15 @@ def main() -> None:
         print(table(flags.out))
         return
     for case in _cases(flags.demo, flags.scenes, flags.photos, flags.out):
-        for way in WAYS:
+        for way in flags.ways:
             file = flags.out / f"{case.name}-{way}.json"
             if file.is_file() or (WAYS[way].masked and masks_of(way) not in case.masks):
                 continue
-            row, poses = _solve(case, way, flags.out)
-            row |= _against(poses, case.truth)
-            told = {name: pose.tolist() for name, pose in poses.items()}
-            write_json(file, row | {"poses": told})
-            print(json.dumps(row), flush=True)
+            _keep(file, *_solve(case, way, flags.out), case.truth)
+    for folder in flags.scenes if flags.artifacts else []:
+        truth = _true_poses(folder / "truth/cameras.json")
+        row, poses = _by_the_stage(folder, flags.artifacts / folder.name / "poses")
+        _keep(flags.out / f"{folder.name}-stage.json", row, poses, truth)
 
 
 if __name__ == "__main__":
