@@ -9,8 +9,9 @@ detector, where the scene has been through `masks`), `true` (masks from the true
 one attempt; and `retried`, true masks with the further attempts that the stage makes.
 `--demo` and `--scenes` are folders that `synthesize` made, solved wet and dry; the demo's clean views
 are also wetted with heavy drops, the same in all. `--ways` solves in these alone. `--artifacts` adds
-what the stages made of the scenes, `stage`: DIR/<scene>/poses is compared with the truth. `--photos` are dry photos without truth: poses of the dry ones
-stand for it. Results go to DIR/<case>-<way>.json, one at a time; what is there is not done again.
+what the stages made of the scenes, `stage`: DIR/<scene>/poses is compared with the truth. `--photos`
+are dry photos without truth: poses of the dry ones stand for it. Results go to DIR/<case>-<way>.json,
+one at a time; what is there is not done again.
 """
 
 from __future__ import annotations
