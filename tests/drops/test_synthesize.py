@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.drops import bake as baking
 from pipeline.drops import mitsuba_scene as ms
-from pipeline.drops import places, synthesis
+from pipeline.drops import pane, places, synthesis
 from pipeline.drops.places_parts import Builder
 from pipeline.drops.shape import Drop
 from pipeline.errors import UserError
@@ -136,6 +136,27 @@ def test_pane_in_the_scene_stays_and_pane_on_the_lens_follows(baked: ms.Baked) -
 
     assert middle(world_from_pane=fixed) == pytest.approx(16 - 0.05 / 0.3 * 27, abs=0.2)
     assert middle(pane_m=0.3) == pytest.approx(16, abs=0.2)
+
+
+@ray_traced
+def test_painted_pane_covers_what_the_rendered_one_covers(baked: ms.Baked) -> None:
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.array([0.15, 0.3, 0.1]))[0]
+    pose[:3, 3] = [0.1, -0.02, 0.03]
+    fixed = np.eye(4)
+    fixed[2, 3] = 0.3
+    drops = [
+        replace(drop(x), center=(x, y)) for x, y in ((-0.12, 0.0), (0.0, 0.05), (-0.04, -0.06))
+    ]
+    rendered = ms.render(
+        baked, CAMERA, pose, spp=256, seed=5, drops=drops, world_from_pane=fixed
+    ).alpha
+    grey = np.full((24, 32, 3), 0.5, np.float32)
+    how = {"aperture_radius": CAMERA.aperture_m, "focus_distance": CAMERA.focus_m}
+    k = synthesis.camera_matrix(CAMERA)
+    _, alpha = pane.paint_pane(grey, drops, pose @ fixed, k, supersample=8, **how)
+    assert rendered.sum() > 20 and alpha.sum() == pytest.approx(rendered.sum(), rel=0.03)
+    assert np.minimum(alpha, rendered).sum() > 0.95 * np.maximum(alpha, rendered).sum()
 
 
 @ray_traced
