@@ -1,0 +1,98 @@
+"""What the removers learn from: pairs of rainy and dry pictures, and crops of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+# |rainy - clean| beyond this is a drop, in Qian et al. (CVPR 2018) as for all who use their pairs.
+DIFFERENCE = 30 / 255
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Rainy pictures, the same without drops, and how much of each pixel is water.
+
+    rainy, clean: sequences of (H,W,3), or of clips (T,H,W,3) whose drops stay where they are, uint8
+    RGB; coverage: of (H,W) uint8, 255 = all water. share: how often crops are drawn from these
+    pictures, relative to others.
+    """
+
+    rainy: Sequence[np.ndarray]
+    clean: Sequence[np.ndarray]
+    coverage: Sequence[np.ndarray]
+    share: float = 1.0
+
+
+class Batch(NamedTuple):
+    """rainy, clean (B,T,3,H,W), red first, in [0,1], T = 1 but for clips; drops (B,T,1,H,W), 0 or 1."""
+
+    rainy: Tensor
+    clean: Tensor
+    drops: Tensor
+
+
+def drop_map(rainy: Tensor, clean: Tensor) -> Tensor:
+    """1 where any channel differs by more than 30 of 255, else 0: (...,1,H,W) of (...,3,H,W).
+
+    Source: Qian et al., CVPR 2018, section 4.1.
+    """
+    return ((rainy - clean).abs().amax(-3, keepdim=True) > DIFFERENCE).to(rainy.dtype)
+
+
+def draw_batch(pools: Sequence[Pairs], rng: np.random.Generator, batch: int, crop: int) -> Batch:
+    """Crops at random places, scales, sides and exposures; both partners of a pair alike.
+
+    All pictures that one batch is drawn from must have the same number of frames.
+    """
+    shares = np.array([pool.share for pool in pools], np.float64)
+    drawn = []
+    for _ in range(batch):
+        pool = pools[rng.choice(len(pools), p=shares / shares.sum())]
+        index = int(rng.integers(len(pool.rainy)))
+        frames = [
+            part[index] if part[index].ndim == 4 else part[index][None]
+            for part in (pool.rainy, pool.clean)
+        ]
+        drawn.append(_draw(*frames, pool.coverage[index], rng, crop))
+    rainy, clean = (
+        torch.from_numpy(np.stack([pair[k] for pair in drawn]).transpose(0, 1, 4, 2, 3).copy())
+        for k in (0, 1)
+    )
+    return Batch(rainy, clean, drop_map(rainy, clean))
+
+
+def _draw(
+    rainy: np.ndarray, clean: np.ndarray, cover: np.ndarray, rng: np.random.Generator, crop: int
+) -> tuple[np.ndarray, np.ndarray]:
+    size = min(_window(rng, crop), *cover.shape)
+    # Of two places the wetter one: most of a picture is dry, and there is little to learn there.
+    places = [tuple(int(rng.integers(n - size + 1)) for n in cover.shape) for _ in range(2)]
+    wet = [int(cover[y : y + size : 4, x : x + size : 4].sum()) for y, x in places]
+    y, x = places[int(np.argmax(wet))]
+    pair = np.stack([rainy, clean])[:, :, y : y + size, x : x + size].astype(np.float32) / 255
+    if size != crop:
+        how = cv2.INTER_AREA if size > crop else cv2.INTER_LINEAR
+        flat = pair.reshape(-1, *pair.shape[2:])
+        scaled = np.stack([cv2.resize(frame, (crop, crop), interpolation=how) for frame in flat])
+        pair = scaled.reshape(*pair.shape[:2], crop, crop, 3)
+    if rng.random() < 0.5:
+        pair = pair[..., ::-1, :]
+    if rng.random() < 0.5:  # what a camera set otherwise would have made of both
+        pair = np.power(pair, np.exp(rng.uniform(-0.25, 0.25)))
+        pair = pair * np.exp(rng.normal(0, 0.1) + rng.normal(0, 0.04, 3))
+    both = np.clip(pair, 0, 1).astype(np.float32)
+    return both[0], both[1]
+
+
+def _window(rng: np.random.Generator, crop: int) -> int:
+    """How many pixels a crop takes from the picture: half of them at another scale."""
+    if rng.random() < 0.5:
+        return crop
+    return round(crop * float(np.exp(rng.uniform(np.log(0.7), np.log(1.6)))))

@@ -1,0 +1,271 @@
+"""Fits a remover to pairs of rainy and dry pictures."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline.errors import UserError
+from pipeline.removal.critics import Critic
+from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop
+from pipeline.removal.samples import Batch, Pairs, draw_batch
+
+# Columns of the validation curve; see `curve_rows`.
+CURVE = ("iteration", "loss", "set", "psnr_rainy", "psnr")
+EMA_DECAY = 0.998
+WARM = 20  # iterations at the start of a phase in which the rate rises
+Kind = Literal["carry", "pairs", "clips"]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of training.
+
+    kind: `pairs` of single pictures, `clips` of several frames, or `carry`: the rainy picture is to
+    come out unchanged. rate: Adam's at its start; it falls along a half cosine to a twentieth, or
+    along (1 - progress)^power where a power is given (0: it stays).
+    """
+
+    kind: Kind
+    iterations: int
+    batch: int
+    crop: int
+    rate: float
+    power: float | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What holds for all phases.
+
+    single_share: of the iterations with clips, how many look at five times as many single pictures
+    instead. critic_rate: Adam's, for the discriminator. adversarial: how many times the published weight
+    its verdict has; 0: there is none.
+    """
+
+    seed: int
+    betas: tuple[float, float]
+    bfloat16: bool
+    adversarial: float = 0.0
+    critic_rate: float = 1e-4
+    single_share: float = 0.0
+
+
+class Trainer:
+    """A fit under way: the remover, its running average, its optimisers and how far it is.
+
+    Every batch, and what dropout leaves out, is drawn from generators seeded with (seed, phase,
+    iteration), so a fit that was interrupted and goes on from `state()` ends like one that was not.
+    """
+
+    def __init__(
+        self, recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs],
+        phases: Sequence[Phase], settings: Settings, critic: Critic | None = None,
+        perceptual: nn.Module | None = None,
+    ) -> None:  # fmt: skip
+        _check(recipe, pairs, clips, phases, settings)
+        self.recipe, self.pairs, self.clips = recipe, pairs, clips
+        self.phases, self.settings = phases, settings
+        self.critic, self.perceptual = critic, perceptual
+        self.phase = self.iteration = self.done = 0
+        self.average = copy.deepcopy(recipe).eval()
+        learnt = [each for each in recipe.parameters() if each.requires_grad]
+        self.optimisers = [torch.optim.Adam(learnt, lr=1.0, betas=settings.betas)]
+        if critic is not None:
+            rate = settings.critic_rate
+            self.optimisers.append(torch.optim.Adam(critic.parameters(), rate, settings.betas))
+
+    @property
+    def total(self) -> int:
+        """The iterations of all phases."""
+        return sum(phase.iterations for phase in self.phases)
+
+    @property
+    def finished(self) -> bool:
+        return self.phase >= len(self.phases)
+
+    def advance(self) -> float:
+        """One iteration; its loss."""
+        phase = self.phases[self.phase]
+        where = [self.settings.seed, self.phase, self.iteration]
+        rng = np.random.default_rng(where)
+        torch.manual_seed(int(rng.integers(2**31)))
+        batch = self._draw(phase, rng)
+        self.recipe.train()
+        if phase.kind == "carry":
+            with self._precision():
+                loss = self.recipe.carry(batch)
+            self._apply(loss, phase)
+        else:
+            with self._precision():
+                outcome = self.recipe.outcome(batch, self.perceptual)
+            loss = outcome.loss
+            judged = self.critic is not None and (batch.rainy.shape[1] > 1 or not self.recipe.clips)
+            if judged:
+                assert self.critic is not None
+                fooled = self.critic.fooled(outcome.fake)
+                self._apply(loss + self.settings.adversarial * self.critic.weight * fooled, phase)
+                self._judge(outcome)
+            else:
+                self._apply(loss, phase)
+        self.iteration, self.done = self.iteration + 1, self.done + 1
+        if self.iteration >= phase.iterations:
+            self.phase, self.iteration = self.phase + 1, 0
+        return float(loss.detach())
+
+    def _draw(self, phase: Phase, rng: np.random.Generator) -> Batch:
+        pools, count = self.pairs, phase.batch
+        if phase.kind == "clips":
+            if rng.random() < self.settings.single_share:
+                count *= 5
+            else:
+                pools = self.clips
+        device = next(self.recipe.parameters()).device
+        return Batch(*(part.to(device) for part in draw_batch(pools, rng, count, phase.crop)))
+
+    def _precision(self) -> torch.autocast:
+        device = next(self.recipe.parameters()).device.type
+        return torch.autocast(device, torch.bfloat16, enabled=self.settings.bfloat16)
+
+    def _apply(self, loss: Tensor, phase: Phase) -> None:
+        warm = min(1.0, (self.iteration + 1) / WARM)
+        progress = self.iteration / phase.iterations
+        fall = 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))
+        if phase.power is not None:
+            fall = (1 - progress) ** phase.power
+        optimiser = self.optimisers[0]
+        for group in optimiser.param_groups:
+            group["lr"] = phase.rate * warm * fall
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.recipe.parameters(), 1.0)
+        optimiser.step()
+        decay = min(EMA_DECAY, (self.done + 1) / (self.done + 10))
+        new = self.recipe.state_dict()
+        with torch.no_grad():
+            for name, kept in self.average.state_dict().items():
+                kept.lerp_(new[name], 1 - decay)
+
+    def _judge(self, outcome: Outcome) -> None:
+        """The discriminator's own step."""
+        assert self.critic is not None
+        self.optimisers[1].zero_grad()
+        loss = self.critic.loss(outcome.fake.detach(), outcome.real, outcome.attention)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimisers[1].step()
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs to go on from here: tensors and numbers."""
+        return {
+            "recipe": self.recipe.state_dict(),
+            "average": self.average.state_dict(),
+            "critic": self.critic.state_dict() if self.critic is not None else {},
+            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
+            "where": [self.phase, self.iteration, self.done],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes back to what `state()` returned."""
+        self.recipe.load_state_dict(state["recipe"])
+        self.average.load_state_dict(state["average"])
+        if self.critic is not None:
+            self.critic.load_state_dict(state["critic"])
+        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(saved)
+        self.phase, self.iteration, self.done = state["where"]
+
+    def score(self, pool: Pairs) -> tuple[float, float]:
+        """Mean PSNR (dB) over a pool, of the rainy pictures and of the restored ones.
+
+        Computed as in training, in half precision where that is asked for; sides are cut to what
+        the network reads. Of a clip the middle frame counts.
+        """
+        found = []
+        for index in range(len(pool.rainy)):
+            rainy, clean = (
+                _whole(part[index], self.recipe.multiple) for part in (pool.rainy, pool.clean)
+            )
+            device = next(self.recipe.parameters()).device
+            with torch.inference_mode(), self._precision():
+                restored = self.average.restored(rainy.to(device)).float().clamp(0, 1).cpu()
+            middle = rainy.shape[1] // 2
+            found.append([psnr(each, clean[:, middle]) for each in (rainy[:, middle], restored)])
+        before, after = np.mean(found, axis=0)
+        return float(before), float(after)
+
+
+def psnr(found: Tensor, wanted: Tensor) -> float:
+    """In dB, of pictures in [0,1]; 99 at most, for equal ones."""
+    return float(-10 * torch.log10((found - wanted).square().mean().clamp_min(10**-9.9)))
+
+
+def _whole(picture: np.ndarray, multiple: int) -> Tensor:
+    frames = picture if picture.ndim == 4 else picture[None]
+    height, width = (length // multiple * multiple for length in frames.shape[1:3])
+    planes = frames[:, :height, :width].transpose(0, 3, 1, 2)
+    return torch.from_numpy(np.ascontiguousarray(planes, np.float32))[None] / 255
+
+
+def _check(
+    recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs], phases: Sequence[Phase],
+    settings: Settings,
+) -> None:  # fmt: skip
+    for phase in phases:
+        check_crop(recipe, phase.crop, settings.adversarial > 0)
+        if phase.kind == "clips" and not recipe.clips:
+            raise UserError(
+                "Only wen looks at several frames; the others learn from pairs.",
+                "Set the kind of the phase to pairs under train_remover.",
+            )
+        if not (clips if phase.kind == "clips" else pairs):
+            raise UserError(
+                f"There are no {phase.kind} to train on.", "Give some under train_remover."
+            )
+
+
+def curve_rows(
+    done: int, loss: float, found: Mapping[str, tuple[float, float]]
+) -> list[list[float | str]]:
+    """Rows of the validation curve, one per set of pictures; columns: CURVE."""
+    return [
+        [done, round(loss, 6), name, round(before, 3), round(after, 3)]
+        for name, (before, after) in found.items()
+    ]
+
+
+def curve_text(rows: Sequence[Sequence[float | str]]) -> str:
+    """The validation curve as CSV, with its heading."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([CURVE, *rows])
+    return text.getvalue()
+
+
+def fit(
+    trainer: Trainer,
+    *,
+    validate_every: int,
+    validation: Mapping[str, Pairs],
+    on_score: Callable[[float, dict[str, tuple[float, float]]], None],
+) -> nn.Module:
+    """The running average of the remover after all phases.
+
+    on_score(mean loss since the last call, PSNR before and after per validation pool) is called
+    every `validate_every` iterations and at the end of each phase: there a checkpoint is written.
+    """
+    losses: list[float] = []
+    while not trainer.finished:
+        losses.append(trainer.advance())
+        if trainer.iteration % validate_every == 0:  # 0 after the last one of a phase, too
+            found = {name: trainer.score(pool) for name, pool in validation.items()}
+            on_score(float(np.mean(losses)), found)
+            losses = []
+    return trainer.average
