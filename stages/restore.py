@@ -24,6 +24,7 @@ from pipeline.removal.wen import WenNet
 from pipeline.stage import Job, Section, run
 
 Networks = tuple[nn.Module, ...]
+OWN = "weights/removers/{}.safetensors"  # where train_remover writes them
 
 
 class Params(Section):
@@ -31,7 +32,7 @@ class Params(Section):
 
     method: Literal["attgan", "quan", "wen"]
     weights: Annotated[
-        str, Field(description="the official weights, or your own; none are shipped")
+        str, Field(description="official weights; empty: those that train_remover makes")
     ]
     published_edges: Annotated[
         bool, Field(description="quan: two empty edge channels, as released")
@@ -40,12 +41,13 @@ class Params(Section):
 
 def main(job: Job, params: Params) -> str:
     """Makes `restored/` from the images: dry photos of the same names."""
-    if not params.weights:
+    weights = job.resolve(params.weights or OWN.format(params.method))
+    if not params.weights and not weights.is_file():
         raise UserError(
-            "restore.weights names no file: no weights of these networks are shipped.",
-            "Set it to the released weights (docs/removers.md says where they come from).",
+            f"{weights} does not exist: weights of these networks are not shipped.",
+            f"Make them: python -m stages.train_remover --scene {job.scene} --method {params.method}; "
+            "or set restore.weights to the released ones (docs/removers.md).",
         )
-    weights = job.resolve(params.weights)
     digest = hashlib.sha256(weights.read_bytes()).hexdigest() if weights.is_file() else ""
     networks_of(params.method, weights, digest, job.device)  # what is wrong with them is told once
     records = read_images_json(job.paths.images)

@@ -16,7 +16,6 @@ from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import sample_shots
 from pipeline.io.atomic import write_bytes
 from pipeline.io.images import read_photo, shrink
-from pipeline.removal.samples import Pairs
 from pipeline.removal.wen import FRAMES
 
 CHUNK = 20
@@ -61,7 +60,7 @@ def pan(rng: np.random.Generator, still: np.ndarray, size: int) -> np.ndarray:
 
 
 def paint_clip(
-    rng: np.random.Generator, still: np.ndarray, size: int = SIZE
+    rng: np.random.Generator, still: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rainy and dry frames (T,size,size,3) and their one coverage (size,size), all in [0,1].
 
@@ -82,7 +81,7 @@ def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()
     clips = np.empty((CHUNK, 2 * FRAMES + 1, SIZE, SIZE, 3), np.uint8)
     for k in range(CHUNK):
         rng = np.random.default_rng([seed, chunk, k, 5])
-        rainy, clean, coverage = paint_clip(rng, _still(rng, photos))
+        rainy, clean, coverage = paint_clip(rng, _still(rng, photos), SIZE)
         stacked = np.concatenate([rainy, clean, np.dstack([coverage] * 3)[None]])
         clips[k] = np.rint(np.clip(stacked, 0, 1) * 255).astype(np.uint8)
     buffer = io.BytesIO()
@@ -90,17 +89,17 @@ def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()
     write_bytes(path, buffer.getvalue())
 
 
-def read_chunks(paths: Sequence[Path], count: int | None = None) -> Pairs:
-    """The first `count` clips that `paint_chunk` wrote, left in the files until they are looked at."""
-    clips = [clip for path in paths for clip in np.load(path, mmap_mode="r")][:count]
-    return Pairs(
+def read_chunk(path: Path) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Rainy clips, dry clips and coverage that `paint_chunk` wrote, left in the file until looked at."""
+    clips = np.load(path, mmap_mode="r")
+    return (
         [clip[:FRAMES] for clip in clips],
         [clip[FRAMES : 2 * FRAMES] for clip in clips],
         [clip[-1, ..., 0] for clip in clips],
     )
 
 
-def clips_name(seed: int, photos: Sequence[Path]) -> str:
+def painted_name(seed: int, photos: Sequence[Path]) -> str:
     """A name for clips painted from this seed and these photos, whatever folder they lie in."""
     digest = hashlib.sha256(str(seed).encode())
     for photo in photos:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.errors import UserError
+from pipeline.io.weights import read_state
 from pipeline.removal.wen import Frames
 
 # Channels of VGG's convolutions by its depth; 0 halves the size.
@@ -16,6 +18,7 @@ VGG = {
     16: (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512),
     19: (64, 64, 0, 128, 128, 0, *[256] * 4, 0, *[512] * 4, 0, *[512] * 4),
 }
+DEPTHS = {"attgan": 16, "wen": 19}
 # Layers (numbers of torchvision's `features`) that are compared, with their weights.
 ATTGAN_TAPS = {1: 0.25, 3: 0.25, 6: 0.25, 8: 0.25}  # relu1_1, 1_2, 2_1, 2_2: their mean
 WEN_TAPS = {1: 1 / 32, 6: 1 / 16, 11: 1 / 8, 20: 1 / 4, 29: 1.0}  # relu1_1 to relu5_1
@@ -24,15 +27,18 @@ WEN_TAPS = {1: 1 / 32, 6: 1 / 16, 11: 1 / 8, 20: 1 / 4, 29: 1.0}  # relu1_1 to r
 class PerceptualLoss(nn.Module):
     """The distance of two pictures in a frozen VGG: weighted mean squares, or absolutes, of features.
 
-    state: torchvision's VGG-16 (mean squares, the taps of AttGAN) or VGG-19 (absolutes, those of Wen
-    et al.), of which only the convolutions that are needed are read. Pictures go in as they are,
-    without ImageNet's mean and deviation, as in the released codes. UserError for other weights.
+    path: torchvision's state dict of VGG-16 for `attgan` (mean squares) or VGG-19 for `wen`
+    (absolutes), of which only the convolutions that are needed are read. Pictures go in as they are,
+    without ImageNet's mean and deviation, as in the released codes. UserError for other weights, and
+    for `quan`, which has no such loss.
     """
 
-    def __init__(
-        self, state: Mapping[str, Tensor], depth: int, origin: str = "the weights"
-    ) -> None:
+    def __init__(self, path: Path, method: str) -> None:
         super().__init__()
+        hint = "Set train_remover.perceptual to VGG-16 (attgan) or VGG-19 (wen), or to nothing."
+        if method not in DEPTHS:
+            raise UserError(f"{method} is trained without a perceptual loss.", hint)
+        depth, state = DEPTHS[method], read_state(path, hint)
         self.taps = ATTGAN_TAPS if depth == 16 else WEN_TAPS
         self.distance = F.mse_loss if depth == 16 else F.l1_loss
         layers: list[nn.Module] = []
@@ -48,8 +54,7 @@ class PerceptualLoss(nn.Module):
         missing = [name for name in wanted if name not in state]
         if missing:
             raise UserError(
-                f"{origin} is not torchvision's VGG-{depth}: {missing[0]} is missing.",
-                "Set train_remover.perceptual to such a state dict, or to nothing.",
+                f"{path} is not torchvision's VGG-{depth}: {missing[0]} is missing.", hint
             )
         self.features.load_state_dict({short: state[long] for long, short in wanted.items()})
         self.requires_grad_(False)

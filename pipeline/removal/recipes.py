@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -30,19 +30,6 @@ class Outcome(NamedTuple):
     fake: Tensor
     real: Tensor
     attention: Tensor
-
-
-class Recipe(Protocol):
-    """A remover in training; a torch module whose state is that of its networks."""
-
-    multiple: int
-    clips: bool
-
-    def outcome(self, batch: Batch, perceptual: nn.Module | None) -> Outcome: ...
-
-    def carry(self, batch: Batch) -> Tensor: ...
-
-    def restored(self, rainy: Tensor) -> Tensor: ...
 
 
 class AttganRecipe(nn.Module):
@@ -140,6 +127,21 @@ class WenRecipe(nn.Module):
 
 
 AnyRecipe = AttganRecipe | QuanRecipe | WenRecipe
+
+
+def recipe_of(
+    method: str, seed: int, *, attention: nn.Module | None, map_loss: MapLoss,
+    train_attention: bool, steps: int, published_edges: bool,
+) -> AnyRecipe:  # fmt: skip
+    """The recipe of `attgan`, `quan` or `wen` with its starting weights; attgan needs `attention`."""
+    recipe: AnyRecipe
+    if method == "attgan":
+        assert attention is not None
+        recipe = AttganRecipe(attention, map_loss, train_attention=train_attention, steps=steps)
+    else:
+        recipe = QuanRecipe(published_edges=published_edges) if method == "quan" else WenRecipe()
+    recipe.begin(seed)
+    return recipe
 
 
 def critic_of(recipe: AnyRecipe, seed: int) -> Critic:

@@ -60,7 +60,7 @@ def draw_batch(pools: Sequence[Pairs], rng: np.random.Generator, batch: int, cro
             part[index] if part[index].ndim == 4 else part[index][None]
             for part in (pool.rainy, pool.clean)
         ]
-        drawn.append(_draw(*frames, pool.coverage[index], rng, crop))
+        drawn.append(_draw(frames[0], frames[1], pool.coverage[index], rng, crop))
     rainy, clean = (
         torch.from_numpy(np.stack([pair[k] for pair in drawn]).transpose(0, 1, 4, 2, 3).copy())
         for k in (0, 1)

@@ -8,22 +8,20 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from pipeline.errors import UserError
-from pipeline.removal.critics import Critic
-from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop
+from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop, critic_of
 from pipeline.removal.samples import Batch, Pairs, draw_batch
 
 # Columns of the validation curve; see `curve_rows`.
 CURVE = ("iteration", "loss", "set", "psnr_rainy", "psnr")
 EMA_DECAY = 0.998
 WARM = 20  # iterations at the start of a phase in which the rate rises
-Kind = Literal["carry", "pairs", "clips"]
 
 
 @dataclass(frozen=True)
@@ -35,29 +33,38 @@ class Phase:
     along (1 - progress)^power where a power is given (0: it stays).
     """
 
-    kind: Kind
+    kind: Literal["carry", "pairs", "clips"]
     iterations: int
     batch: int
     crop: int
     rate: float
-    power: float | None = None
+    power: float | None
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}  # of params.yaml
+
+    def __post_init__(self) -> None:
+        if min(self.iterations, self.batch, self.crop) < 1 or not 0 < self.rate <= 1:
+            raise ValueError("iterations, batch and crop start at 1, the rate lies in (0, 1]")
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What holds for all phases.
-
-    single_share: of the iterations with clips, how many look at five times as many single pictures
-    instead. critic_rate: Adam's, for the discriminator. adversarial: how many times the published weight
-    its verdict has; 0: there is none.
+class Plan:
+    """One remover's training: Adam's betas, how many times the published weight the discriminator's
+    verdict has (0: none is trained), Adam's rate for the discriminator, and the phases.
     """
 
-    seed: int
     betas: tuple[float, float]
-    bfloat16: bool
-    adversarial: float = 0.0
-    critic_rate: float = 1e-4
-    single_share: float = 0.0
+    adversarial: float
+    critic_rate: float
+    phases: list[Phase]
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}  # of params.yaml
+
+    def __post_init__(self) -> None:
+        if not all(0 <= beta < 1 for beta in self.betas) or not self.phases:
+            raise ValueError("betas lie in [0, 1), and there is at least one phase")
+        if self.adversarial < 0 or self.critic_rate <= 0:
+            raise ValueError("adversarial is 0 or more, critic_rate above 0")
 
 
 class Trainer:
@@ -65,24 +72,30 @@ class Trainer:
 
     Every batch, and what dropout leaves out, is drawn from generators seeded with (seed, phase,
     iteration), so a fit that was interrupted and goes on from `state()` ends like one that was not.
+    single_share: of the iterations with clips, how many look at five times as many single pictures
+    instead. bfloat16: products in half precision, about twice as fast where the processor knows it.
     """
 
     def __init__(
-        self, recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs],
-        phases: Sequence[Phase], settings: Settings, critic: Critic | None = None,
+        self, recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs], plan: Plan,
+        *, seed: int, bfloat16: bool = False, single_share: float = 0.0,
         perceptual: nn.Module | None = None,
     ) -> None:  # fmt: skip
-        _check(recipe, pairs, clips, phases, settings)
+        _check(recipe, pairs, clips, plan)
         self.recipe, self.pairs, self.clips = recipe, pairs, clips
-        self.phases, self.settings = phases, settings
-        self.critic, self.perceptual = critic, perceptual
+        self.plan, self.phases, self.seed = plan, plan.phases, seed
+        self.bfloat16, self.single_share, self.perceptual = bfloat16, single_share, perceptual
+        self.critic = critic_of(recipe, seed) if plan.adversarial > 0 else None
         self.phase = self.iteration = self.done = 0
         self.average = copy.deepcopy(recipe).eval()
         learnt = [each for each in recipe.parameters() if each.requires_grad]
-        self.optimisers = [torch.optim.Adam(learnt, lr=1.0, betas=settings.betas)]
-        if critic is not None:
-            rate = settings.critic_rate
-            self.optimisers.append(torch.optim.Adam(critic.parameters(), rate, settings.betas))
+        self.optimisers = [torch.optim.Adam(learnt, lr=1.0, betas=plan.betas)]
+        if perceptual is not None:
+            perceptual.to(_device(recipe))
+        if self.critic is not None:
+            self.critic.to(_device(recipe))
+            judging = self.critic.parameters()
+            self.optimisers.append(torch.optim.Adam(judging, plan.critic_rate, plan.betas))
 
     @property
     def total(self) -> int:
@@ -96,7 +109,7 @@ class Trainer:
     def advance(self) -> float:
         """One iteration; its loss."""
         phase = self.phases[self.phase]
-        where = [self.settings.seed, self.phase, self.iteration]
+        where = [self.seed, self.phase, self.iteration]
         rng = np.random.default_rng(where)
         torch.manual_seed(int(rng.integers(2**31)))
         batch = self._draw(phase, rng)
@@ -113,7 +126,7 @@ class Trainer:
             if judged:
                 assert self.critic is not None
                 fooled = self.critic.fooled(outcome.fake)
-                self._apply(loss + self.settings.adversarial * self.critic.weight * fooled, phase)
+                self._apply(loss + self.plan.adversarial * self.critic.weight * fooled, phase)
                 self._judge(outcome)
             else:
                 self._apply(loss, phase)
@@ -125,16 +138,16 @@ class Trainer:
     def _draw(self, phase: Phase, rng: np.random.Generator) -> Batch:
         pools, count = self.pairs, phase.batch
         if phase.kind == "clips":
-            if rng.random() < self.settings.single_share:
+            if rng.random() < self.single_share:
                 count *= 5
             else:
                 pools = self.clips
-        device = next(self.recipe.parameters()).device
+        device = _device(self.recipe)
         return Batch(*(part.to(device) for part in draw_batch(pools, rng, count, phase.crop)))
 
     def _precision(self) -> torch.autocast:
-        device = next(self.recipe.parameters()).device.type
-        return torch.autocast(device, torch.bfloat16, enabled=self.settings.bfloat16)
+        device = _device(self.recipe).type
+        return torch.autocast(device, torch.bfloat16, enabled=self.bfloat16)
 
     def _apply(self, loss: Tensor, phase: Phase) -> None:
         warm = min(1.0, (self.iteration + 1) / WARM)
@@ -146,7 +159,7 @@ class Trainer:
         for group in optimiser.param_groups:
             group["lr"] = phase.rate * warm * fall
         optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         nn.utils.clip_grad_norm_(self.recipe.parameters(), 1.0)
         optimiser.step()
         decay = min(EMA_DECAY, (self.done + 1) / (self.done + 10))
@@ -160,7 +173,7 @@ class Trainer:
         assert self.critic is not None
         self.optimisers[1].zero_grad()
         loss = self.critic.loss(outcome.fake.detach(), outcome.real, outcome.attention)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         self.optimisers[1].step()
 
     def state(self) -> dict[str, Any]:
@@ -194,7 +207,7 @@ class Trainer:
             rainy, clean = (
                 _whole(part[index], self.recipe.multiple) for part in (pool.rainy, pool.clean)
             )
-            device = next(self.recipe.parameters()).device
+            device = _device(self.recipe)
             with torch.inference_mode(), self._precision():
                 restored = self.average.restored(rainy.to(device)).float().clamp(0, 1).cpu()
             middle = rainy.shape[1] // 2
@@ -215,12 +228,13 @@ def _whole(picture: np.ndarray, multiple: int) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(planes, np.float32))[None] / 255
 
 
-def _check(
-    recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs], phases: Sequence[Phase],
-    settings: Settings,
-) -> None:  # fmt: skip
-    for phase in phases:
-        check_crop(recipe, phase.crop, settings.adversarial > 0)
+def _device(recipe: nn.Module) -> torch.device:
+    return next(recipe.parameters()).device
+
+
+def _check(recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs], plan: Plan) -> None:
+    for phase in plan.phases:
+        check_crop(recipe, phase.crop, plan.adversarial > 0)
         if phase.kind == "clips" and not recipe.clips:
             raise UserError(
                 "Only wen looks at several frames; the others learn from pairs.",
@@ -251,7 +265,6 @@ def curve_text(rows: Sequence[Sequence[float | str]]) -> str:
 
 def fit(
     trainer: Trainer,
-    *,
     validate_every: int,
     validation: Mapping[str, Pairs],
     on_score: Callable[[float, dict[str, tuple[float, float]]], None],

@@ -95,12 +95,15 @@ def test_every_photo_is_restored(scene: Path) -> None:
     assert first.shape == (24, 32, 3)
     assert run_stage(scene, "gen.pkl") == 0
     assert np.array_equal(read_image(out / "a.png"), first)
+    save_tensors(scene / "weights/removers/attgan.safetensors", whole)
+    assert run_stage(scene, "") == 0  # where no weights are named: our own
+    assert np.array_equal(read_image(out / "a.png"), first)
 
 
 @pytest.mark.parametrize(
     ("weights", "told"),
     [
-        ("", "restore.weights names no file"),
+        ("", "train_remover --scene glass --method attgan"),
         ("none.pkl", "do not exist"),
         ("bad.pkl", "is not a PyTorch"),
     ],

@@ -1,0 +1,298 @@
+"""Losses are zero at the truth, starts copy the photo, and interrupted trainings end like others."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from pipeline.attention.network import AttentiveRecurrentNet
+from pipeline.attention.training import attention_loss
+from pipeline.errors import UserError
+from pipeline.io.tensors import save_tensors
+from pipeline.removal import clips
+from pipeline.removal.autoencoder import Scales, multi_scale_loss
+from pipeline.removal.critics import AttentiveCritic, PatchCritic, Verdict
+from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, wen_loss
+from pipeline.removal.recipes import AnyRecipe, recipe_of
+from pipeline.removal.samples import Pairs, draw_batch, drop_map
+from pipeline.removal.training import Phase, Plan, Trainer, fit
+from pipeline.removal.wen import Frames
+
+
+def recipe(method: str) -> AnyRecipe:
+    attention = AttentiveRecurrentNet()
+    attention.initialise(0)
+    return recipe_of(
+        method, 3, attention=attention, map_loss=attention_loss,
+        train_attention=True, steps=1, published_edges=True,
+    )  # fmt: skip
+
+
+def pictures(frames: int = 1, size: int = 40) -> Pairs:
+    """Noise, a square of which is brighter where it is wet."""
+    rng = np.random.default_rng(0)
+    shape = (size, size, 3) if frames == 1 else (frames, size, size, 3)
+    clean = [rng.integers(20, 150, shape, dtype=np.uint8) for _ in range(2)]
+    cover = np.zeros((size, size), np.uint8)
+    cover[8:20, 8:20] = 255
+    rainy = [np.where(cover[..., None] > 0, each + 90, each).astype(np.uint8) for each in clean]
+    return Pairs(rainy, clean, [cover, cover])
+
+
+def plan(kind: str, iterations: int = 2, crop: int = 32, adversarial: float = 0.0) -> Plan:
+    phase = Phase(kind, iterations, 1, crop, 1e-3, None)  # type: ignore[arg-type]
+    return Plan((0.9, 0.99), adversarial, 1e-4, [phase])
+
+
+@pytest.mark.parametrize("method", ["attgan", "quan"])
+def test_a_remover_starts_by_copying_its_photo(method: str) -> None:
+    rainy = torch.rand(1, 1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        found = recipe(method).eval().restored(rainy)
+    assert torch.allclose(found, rainy[:, 0], atol=1e-5)
+
+
+def test_the_way_down_of_wen_starts_with_every_pixel_in_a_channel_of_its_own() -> None:
+    frame = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        found = recipe("wen").network.main_branch(frame * 2 - 1)[0, :48]
+    # Channels: colour, then row and column of the pixel among 2x2, then of those among 2x2.
+    blocks = frame[0].view(3, 8, 2, 2, 8, 2, 2) * 2
+    expected = blocks.permute(0, 3, 6, 2, 5, 1, 4).reshape(48, 8, 8)
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
+def test_losses_are_zero_at_the_truth() -> None:
+    dry = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    sizes = [F.interpolate(dry, (n, n), mode="bilinear", antialias=True) for n in (4, 8, 16)]
+    assert float(multi_scale_loss(Scales(*sizes), dry)) == pytest.approx(0, abs=1e-9)
+
+    clean = torch.rand(1, 5, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    drops = torch.zeros(1, 5, 1, 32, 32)
+    drops[..., 4:9, 4:9] = 1
+    flat = clean.flatten(0, 1)
+    truth = Frames(flat[..., ::4, ::4], flat[..., ::2, ::2], clean, 1 - drops)
+    assert float(wen_loss(truth, clean, clean, drops)) < 2e-5  # the map's logarithm is cut at 1e-6
+    # Off by 0.1 everywhere: 25 x 0.01, and again where it is wet; nothing at the smaller sizes.
+    wrong = truth._replace(full=clean + 0.1)
+    wet = float(drops.mean())
+    assert float(wen_loss(wrong, clean, clean, drops)) == pytest.approx(0.25 * (1 + wet), rel=1e-3)
+    # A map that says the opposite is as wrong as it can be.
+    assert float(wen_loss(truth._replace(clear=drops), clean, clean, drops)) > 100
+
+
+def test_the_discriminators_maps_are_to_be_the_generators_and_nothing() -> None:
+    attention = torch.rand(1, 1, 8, 8)
+    nothing = torch.zeros(1, 1, 8, 8)
+    assert float(adversarial_map_loss(attention, nothing, attention)) == 0
+    assert float(adversarial_map_loss(nothing, nothing + 2, attention * 0)) == 4
+
+
+def test_attentive_discriminator_is_the_published_one() -> None:
+    critic = AttentiveCritic()
+    assert sum(value.numel() for value in critic.parameters()) == 7_737_746
+    dense = sum(value.numel() for value in critic.fc.parameters())
+    assert 7_737_746 - dense == 1_313_169
+    verdict = critic(torch.rand(1, 3, 224, 224))
+    assert verdict.probability.shape == (1, 1) and verdict.attention.shape == (1, 1, 224, 224)
+
+
+def test_the_attentive_discriminators_loss_is_nothing_where_it_is_right() -> None:
+    critic = AttentiveCritic()
+    attention, nothing = torch.rand(1, 1, 4, 4), torch.zeros(1, 1, 4, 4)
+    right = {
+        "fake": Verdict(torch.zeros(1, 1), attention),
+        "real": Verdict(torch.ones(1, 1), nothing),
+    }
+    critic.forward = lambda kind: right[kind]  # type: ignore[method-assign,assignment]
+    assert float(critic.loss("fake", "real", attention)) == pytest.approx(0, abs=1e-5)  # type: ignore[arg-type]
+    # A wrong map costs 0.05 of its square, and the generator gains nothing from what is seen through.
+    wrong = attention + 2
+    assert float(critic.loss("fake", "real", wrong)) == pytest.approx(0.2, abs=1e-5)  # type: ignore[arg-type]
+    assert float(critic.fooled("fake")) == pytest.approx(0, abs=1e-5)  # type: ignore[arg-type]
+    assert float(critic.fooled("real")) < -10  # type: ignore[arg-type]
+
+
+def test_patches_are_judged_at_three_scales_and_squares_vanish_at_the_truth() -> None:
+    critic = PatchCritic()
+    sides = [verdict.shape[-1] for verdict in critic(torch.rand(1, 15, 64, 64))]
+    assert len(sides) == 3 and sides[0] > sides[1] > sides[2]
+    critic.forward = lambda frames: [frames]  # type: ignore[method-assign]
+    assert float(critic.fooled(torch.ones(2, 2))) == 0
+    assert float(critic.loss(torch.zeros(2, 2), torch.ones(2, 2), torch.zeros(1))) == 0
+    assert float(critic.loss(torch.ones(2, 2), torch.zeros(2, 2), torch.zeros(1))) == 1
+
+
+@pytest.mark.parametrize(("method", "depth"), [("attgan", (64, 64, 0, 128, 128)),
+                         ("wen", (64, 64, 0, 128, 128, 0, *[256] * 4, 0, *[512] * 4, 0, 512))])  # fmt: skip
+def test_features_of_a_vgg_tell_pictures_apart(
+    tmp_path: Path, method: str, depth: tuple[int, ...]
+) -> None:
+    torch.manual_seed(0)
+    state, layer, channels = {}, 0, 3
+    for width in depth:  # torchvision counts products, cuts and halvings alike
+        if width:
+            state[f"features.{layer}.weight"] = (
+                torch.randn(width, 1, 3, 3).expand(-1, channels, -1, -1) * 0.05
+            )
+            state[f"features.{layer}.bias"] = torch.zeros(width)
+            channels = width
+        layer += 2 if width else 1
+    path = tmp_path / "vgg.safetensors"
+    save_tensors(path, state)
+    loss = PerceptualLoss(path, method)
+    x = torch.rand(1, 3, 32, 32)
+    assert float(loss(x, x)) == 0
+    assert float(loss(x, 1 - x)) > 0
+    assert not any(value.requires_grad for value in loss.parameters())
+    first = F.relu(F.conv2d(x, state["features.0.weight"], padding=1))
+    assert torch.allclose(loss.features[:2](x), first, atol=1e-6)
+    with pytest.raises(UserError, match="without a perceptual loss"):
+        PerceptualLoss(path, "quan")
+    save_tensors(path, {"features.0.weight": state["features.0.weight"]})
+    with pytest.raises(
+        UserError, match=r"is not torchvision's VGG-\d+: features.0.bias is missing"
+    ):
+        PerceptualLoss(path, method)
+
+
+def test_batches_hold_both_partners_alike_and_clips_their_frames() -> None:
+    found = draw_batch([pictures()], np.random.default_rng(0), 3, 32)
+    assert found.rainy.shape == found.clean.shape == (3, 1, 3, 32, 32)
+    assert found.drops.shape == (3, 1, 1, 32, 32)
+    assert torch.equal(found.drops, drop_map(found.rainy, found.clean))
+    dry = (found.drops == 0).expand_as(found.rainy)
+    assert float((found.rainy - found.clean)[dry].abs().max()) <= 30 / 255
+    assert 0 < float(found.drops.mean()) < 1
+    assert draw_batch([pictures(5)], np.random.default_rng(0), 1, 32).rainy.shape == (
+        1,
+        5,
+        3,
+        32,
+        32,
+    )
+
+
+def test_more_than_thirty_is_a_drop() -> None:
+    clean = torch.zeros(1, 3, 1, 2)
+    rainy = clean.clone()
+    rainy[0, 1] = torch.tensor([29.9 / 255, 30.1 / 255])
+    assert drop_map(rainy, clean).flatten().tolist() == [0, 1]
+
+
+def test_clips_move_behind_drops_that_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clips, "CHUNK", 2)
+    monkeypatch.setattr(clips, "SIZE", 48)
+    path = tmp_path / "0.npy"
+    clips.paint_chunk(path, 4, 0)
+    rainy, clean, coverage = clips.read_chunk(path)
+    assert len(rainy) == 2 and rainy[0].shape == clean[0].shape == (5, 48, 48, 3)
+    assert coverage[0].shape == (48, 48)
+    assert all(np.abs(clip[0].astype(int) - clip[4]).mean() > 1 for clip in clean)
+    for wet, dry, cover in zip(rainy, clean, coverage, strict=True):
+        change = np.abs(wet.astype(int) - dry).mean(-1)
+        spread = change[:, cover == 0].mean()  # of the codec
+        assert spread < 8 and spread < change[:, cover > 0].mean()
+    written = path.read_bytes()
+    path.unlink()
+    clips.paint_chunk(path, 4, 0)
+    assert path.read_bytes() == written
+
+
+def test_a_still_picture_passes_by_at_the_speed_of_the_camera() -> None:
+    """A ramp's brightness tells where each view looks: equal steps, none beyond its border."""
+    ramp = np.repeat(np.linspace(0, 1, 200, dtype=np.float32)[None, :, None], 200, 0)
+    views = clips.pan(np.random.default_rng(3), np.repeat(ramp, 3, 2), 40)
+    assert views.shape == (5, 40, 40, 3)
+    middles = views[:, 20, 19:21, 0].mean(1)
+    steps = np.diff(middles)
+    assert np.allclose(steps, steps.mean(), atol=2e-3) and abs(steps.mean()) > 1e-3
+    assert views[:, 20, :, 0].min() > 0 and views[:, 20, :, 0].max() < 1
+
+
+@pytest.mark.parametrize(
+    ("method", "kind", "frames", "adversarial"),
+    [
+        ("attgan", "pairs", 1, 0.0),
+        ("quan", "pairs", 1, 0.0),
+        ("wen", "clips", 5, 1.0),
+        ("wen", "carry", 1, 0.0),
+    ],
+)
+def test_interrupted_and_resumed_is_the_same(
+    method: str, kind: str, frames: int, adversarial: float
+) -> None:
+    def trainer() -> Trainer:
+        pool = [pictures(frames)]
+        return Trainer(recipe(method), pool, pool, plan(kind, adversarial=adversarial), seed=1)
+
+    whole, first, second = trainer(), trainer(), trainer()
+    before = {name: value.clone() for name, value in whole.recipe.state_dict().items()}
+    for _ in range(2):
+        loss = whole.advance()
+    assert math.isfinite(loss) and whole.finished
+    first.advance()
+    second.restore(first.state())
+    assert second.advance() == loss
+    for name, value in whole.average.state_dict().items():
+        assert torch.equal(value, second.average.state_dict()[name]), name
+    changed = sum(not torch.equal(v, before[n]) for n, v in whole.recipe.state_dict().items())
+    assert changed > 10
+
+
+def test_a_few_steps_lower_the_loss_on_what_they_see() -> None:
+    phases = [Phase("pairs", 8, 1, 32, 1e-3, 0.0)]
+    trainer = Trainer(
+        recipe("quan"), [pictures()], [], Plan((0.9, 0.99), 0.0, 1e-4, phases), seed=1
+    )
+    seen: list[float] = []
+    fit(trainer, 4, {"all": pictures(size=33)}, lambda loss, found: seen.append(loss))
+    assert len(seen) == 2 and seen[1] < seen[0]
+
+
+def test_the_attention_stays_as_it_is_unless_it_is_to_learn() -> None:
+    made = recipe("attgan")
+    frozen = recipe_of("attgan", 3, attention=AttentiveRecurrentNet(), map_loss=attention_loss,
+                       train_attention=False, steps=1, published_edges=True)  # fmt: skip
+    for each, learns in ((made, True), (frozen, False)):
+        before = {k: v.clone() for k, v in each.state_dict().items()}
+        Trainer(each, [pictures()], [], plan("pairs", 1), seed=0).advance()
+        same = [torch.equal(v, before[k]) for k, v in each.state_dict().items() if "attention" in k]
+        assert all(same) != learns
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "told"),
+    [
+        ("attgan", plan("pairs", crop=34), "no multiple of 4"),
+        ("wen", plan("clips", crop=48), "no multiple of 32"),
+        ("attgan", plan("pairs", crop=64, adversarial=1), "reads 224x224 pixels, not 64"),
+        ("quan", plan("pairs", adversarial=1), "without a discriminator"),
+        ("quan", plan("clips"), "Only wen looks at several frames"),
+        ("wen", plan("clips"), "There are no clips to train on"),
+    ],
+)
+def test_what_cannot_be_trained_is_told_in_a_sentence(method: str, wrong: Plan, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        Trainer(recipe(method), [pictures()], [], wrong, seed=0)
+
+
+def test_numbers_out_of_range_are_refused() -> None:
+    for values in (("pairs", 0, 1, 32, 0.1, None), ("pairs", 1, 1, 32, 0.0, None)):
+        with pytest.raises(ValueError, match="the rate lies in"):
+            Phase(*values)  # type: ignore[arg-type]
+    phases = [Phase("pairs", 1, 1, 32, 0.1, None)]
+    for betas, adversarial, given in (
+        ((1.0, 0.9), 0, phases),
+        ((0.9, 0.9), -1, phases),
+        ((0, 0), 0, []),
+    ):
+        with pytest.raises(ValueError, match=r"lie in|is 0 or more"):
+            Plan(betas, adversarial, 1e-4, given)
