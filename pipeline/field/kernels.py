@@ -16,10 +16,22 @@ from pipeline.geometry.spaces import EPS
 
 # Reordering sums lets them run in vectors; infinities and NaN must survive, or a broken fit goes unseen.
 _FLAGS = {"contract", "reassoc", "nsz", "arcp"}
-compiled: Any = numba.njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-inlined: Any = numba.njit(
-    nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy", inline="always"
-)
+
+
+def compiled(function: Any, inline: str = "never") -> Any:
+    """The function as machine code, made at its first call and kept on disk where that is allowed."""
+    how = {"nogil": True, "fastmath": _FLAGS, "error_model": "numpy", "inline": inline}
+    try:
+        return numba.njit(cache=True, **how)(function)
+    except RuntimeError:  # neither the project's folder nor the user's cache can be written
+        return numba.njit(**how)(function)
+
+
+def inlined(function: Any) -> Any:
+    """As :func:`compiled`, within the functions that call it."""
+    return compiled(function, "always")
+
+
 P1, P2 = np.int32(2654435761 - 2**32), np.int32(805459861)
 
 
