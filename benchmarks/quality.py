@@ -4,11 +4,11 @@
     python -m benchmarks.quality data/demo --rows clean,true --steps 3000 --set samples=12
 
 A scene is a folder with photos and `truth/` (`clean/`, `coverage/`, `cameras.json`, perhaps
-`depth/`), as `synthesize` makes it. Estimated poses and the detector's masks are read from
-`artifacts/<scene>/` where they exist. Every eighth view is held out and compared with its clean
-reference; settings are those of params.yaml. *seen*: the pixels whose surface at least three fitted
-photos show without a drop, by the depth of the clean fit; the oracle gap is the loss against the
-clean photos with the same poses.
+`depth/`), as `synthesize` makes it. Estimated poses and the masks of the stages `masks` and
+`refine` are read from `artifacts/<scene>/` where they exist. Every eighth view is held out and
+compared with its clean reference; settings are those of params.yaml. *seen*: the pixels whose
+surface at least three fitted photos show without a drop, by the depth of the clean fit; the oracle
+gap is the loss against the clean photos with the same poses.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ ROWS = {
     "true": ("rainy", "true", "true"),
     "clean-sfm": ("clean", "none", "sfm"),
     "true-sfm": ("rainy", "true", "sfm"),
-    "detector-sfm": ("rainy", "detector", "sfm"),
+    "masks": ("rainy", "masks", "true"),
+    "refine": ("rainy", "refine", "true"),
+    "masks-sfm": ("rainy", "masks", "sfm"),
+    "refine-sfm": ("rainy", "refine", "sfm"),
 }
 FIELD = (
     "samples",
@@ -68,7 +71,7 @@ class Scene:
     rainy: dict[str, np.ndarray]
     clean: dict[str, np.ndarray]
     coverage: dict[str, np.ndarray]
-    detected: dict[str, np.ndarray]
+    drawn: dict[str, dict[str, np.ndarray]]  # keep masks of the stages `masks` and `refine`
     views: dict[str, dict[str, View]]  # poses "true" and, if there are any, "sfm"
 
 
@@ -93,13 +96,16 @@ def load(folder: Path, artifacts: Path) -> Scene:
         coverage[stem] = raw.astype(np.float32) / np.iinfo(raw.dtype).max
     poses = artifacts / "poses" / "transforms.json"
     sfm = {Path(n).stem: v for n, v in read_transforms(poses).items()} if poses.is_file() else {}
-    detected = {
-        stem: read_keep_mask(artifacts / "masks" / f"{stem}.png")
-        for stem in photos
-        if (artifacts / "masks" / f"{stem}.png").is_file()
+    drawn = {
+        stage: {
+            stem: read_keep_mask(artifacts / stage / f"{stem}.png")
+            for stem in photos
+            if (artifacts / stage / f"{stem}.png").is_file()
+        }
+        for stage in ("masks", "refine")
     }
     views = {"true": _true_views(truth, list(photos), sfm)} | ({"sfm": sfm} if sfm else {})
-    return Scene(rainy, clean, coverage, detected, views)
+    return Scene(rainy, clean, coverage, drawn, views)
 
 
 def _true_views(truth: Path, stems: list[str], sfm: dict[str, View]) -> dict[str, View]:
@@ -137,8 +143,8 @@ def measure(
         keep_mask = np.ones(image.shape[:2], bool)
         if masks == "true":
             keep_mask = scene.coverage[stem] <= TRUE_COVERAGE
-        elif masks == "detector":
-            keep_mask = scene.detected[stem]
+        elif masks != "none":
+            keep_mask = scene.drawn[masks][stem]
         view = views[stem]
         photos.append(
             PosedPhoto(stem, image, keep_mask, view.cam_from_world, view.intrinsics, near, far)
@@ -146,11 +152,11 @@ def measure(
     config = {key: settings[key] for key in FIELD}
     field = build_around("fast", list(views.values()), near, far, **config)
     buffer = RayBuffer(photos, settings["seed"])
-    begin = time.perf_counter()
+    begin = time.process_time()
     fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
         seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
         threads=threads)  # fmt: skip
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     torch.set_num_threads(threads)
     renders = {}
     for stem in stems if not seen else held_out:
@@ -206,12 +212,12 @@ def main() -> None:
         print(f"{folder.name}: {len(scene.rainy)} views, {covered:.1%} covered, "
               f"{settings['steps']} steps of {settings['batch_rays']} rays")  # fmt: skip
         print(f"{'photos':6} {'masks':8} {'poses':5} {'PSNR':>6} {'gap':>6} {'seen':>6} "
-              f"{'gap':>6} {'fit s':>6}", flush=True)  # fmt: skip
+              f"{'gap':>6} {'cpu s':>6}", flush=True)  # fmt: skip
         seen: dict[str, np.ndarray] = {}
         clean: dict[str, Result] = {}
         for row in flags.rows.split(","):
             kind, masks, poses = ROWS[row]
-            if poses not in scene.views or (masks == "detector" and not scene.detected):
+            if poses not in scene.views or not scene.drawn.get(masks, True):
                 continue
             result = measure(scene, row, settings, flags.threads, seen)
             if kind == "clean":

@@ -121,7 +121,7 @@ class GridField(nn.Module):
         return [
             *tables,
             Part("proposal", ("proposal",), 1e-1, 0.1, betas, 1e-15, 50),
-            Part("head", head, 3e-3, 0.03, betas, 1e-8, 50),
+            Part("head", head, 1e-2, 0.03, betas, 1e-8, 50),
         ]
 
     def _propose(
