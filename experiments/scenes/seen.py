@@ -2,7 +2,8 @@
 
 `python -m experiments.scenes.seen DATA/SCENE...` reads truth/{depth,alpha,cameras.json}. Every
 surface pixel of every third view is carried into all views by its true depth; a view sees it clean
-where its own depth agrees within 2 % and water meets at most 2 % of the rays. Sky is left out.
+where its own depth agrees within 2 % and water meets at most 2 % of the rays. Sky is left out. In brackets
+the same for dry glass: what lies at the rim of the capture or behind things.
 """
 
 from __future__ import annotations
@@ -71,9 +72,11 @@ def main() -> None:
     for data in parser.parse_args().data:
         depth, alpha, poses, k = read(data)
         seen = clean_counts(depth, alpha, poses, k)
+        dry = clean_counts(depth, np.zeros_like(alpha), poses, k)
         print(
-            f"| {data.name} | {len(depth)} | {(alpha > 0.5).mean():.1%} | {(seen == 0).mean():.2%} "
-            f"| {(seen < 3).mean():.2%} |",
+            f"| {data.name} | {len(depth)} | {(alpha > 0.5).mean():.1%} "
+            f"| {(seen == 0).mean():.2%} ({(dry == 0).mean():.2%}) "
+            f"| {(seen < 3).mean():.2%} ({(dry < 3).mean():.2%}) |",
             flush=True,
         )
 
