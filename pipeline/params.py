@@ -14,7 +14,9 @@ from pipeline.errors import UserError
 
 STAGES = Path(__file__).resolve().parents[1] / "stages"
 CORRECT = "Correct it and run again."
-OTHER_SECTIONS = ("scene_defaults", "scenes", "variants", "comparisons")
+OTHER_SECTIONS = ("scene_defaults", "scenes", "variants", "comparisons", "comparison")
+BASE = "base"  # another file of parameters, which this one changes
+FOLDERS = "folders"  # of a variant: where it finds its photos, masks, ...
 
 
 class Section(pydantic.BaseModel):
@@ -54,8 +56,10 @@ def read_params(file: Path) -> dict[str, Any]:
     except (YAMLError, UnicodeDecodeError) as error:
         raise UserError(f"{file} is not valid YAML{_place(error)}.", CORRECT) from None
     content = _mapping(file, "the file", content)
-    known = (*stage_names(), *OTHER_SECTIONS)
+    known = (*stage_names(), *OTHER_SECTIONS, BASE)
     _refuse_unknown(file, "section", content, known)
+    if BASE in content:
+        content = _upon(file, read_params(file.parent / str(content[BASE])), content)
     for kind in ("scenes", "variants"):
         if not content.get(kind):
             continue
@@ -63,8 +67,31 @@ def read_params(file: Path) -> dict[str, Any]:
         content[kind] = {str(name): values for name, values in choices.items()}
         for name, values in content[kind].items():
             overrides = _mapping(file, f"{kind}.{name}", values or {})
-            _refuse_unknown(file, f"section in {kind}.{name}", overrides, stage_names())
+            allowed = [*stage_names(), *([FOLDERS] if kind == "variants" else [])]
+            _refuse_unknown(file, f"section in {kind}.{name}", overrides, allowed)
     return content
+
+
+def _upon(file: Path, below: dict[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of one file upon those of its base: key by key within a section."""
+    merged = dict(below)
+    for section, values in above.items():
+        if section != BASE:
+            own = _mapping(file, section, values or {})
+            merged[section] = {**(below.get(section) or {}), **own}
+    return merged
+
+
+def read_folders(file: Path, variant: str | None) -> dict[str, str]:
+    """The folders that a variant finds elsewhere, by the name that they have without it.
+
+    Given under `variants.<variant>.folders`, relative to the scene's artifacts. Empty without a variant.
+    """
+    if variant is None:
+        return {}
+    chosen = _chosen(file, read_params(file), "variants", variant).get(FOLDERS) or {}
+    where = f"variants.{variant}.{FOLDERS}"
+    return {str(name): str(place) for name, place in _mapping(file, where, chosen).items()}
 
 
 def _place(error: Exception) -> str:

@@ -10,8 +10,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import FrameType
@@ -23,7 +23,7 @@ from tqdm import tqdm
 from pipeline.errors import UserError
 from pipeline.io.atomic import disk_fault, disk_faults
 from pipeline.io.paths import ScenePaths
-from pipeline.params import Section, read_section
+from pipeline.params import Section, read_folders, read_section
 
 __all__ = ["Job", "Section", "run"]
 
@@ -49,10 +49,11 @@ class Job:
     device_wish: str
     scheduler: str | None
     verbose: bool
+    folders: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def paths(self) -> ScenePaths:
-        return ScenePaths(self.root, self.scene, self.variant)
+        return ScenePaths(self.root, self.scene, self.variant, self.folders)
 
     @cached_property
     def device(self) -> str:
@@ -132,10 +133,17 @@ def _run(
     params_file: Path,
     flags: argparse.Namespace,
 ) -> int:
+    params = read_section(params_file, name, params_type, flags.scene, flags.variant)
+    folders = read_folders(params_file, flags.variant)
     job = Job(
-        params_file.parent, flags.scene, flags.variant, flags.device, flags.scheduler, flags.verbose
+        params_file.parent,
+        flags.scene,
+        flags.variant,
+        flags.device,
+        flags.scheduler,
+        flags.verbose,
+        folders,
     )
-    params = read_section(params_file, name, params_type, job.scene, job.variant)
     work = job.paths.work(name)
     try:
         with disk_faults(work):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from pipeline.stage import Job, Section, run
 class Params(Section):
     """The section `render` of params.yaml."""
 
+    views: Literal["all", "test"]
     feather_px: Annotated[float, Field(ge=0, le=100)]
     gain_px: Annotated[float, Field(ge=1, le=1000)]
     path_frames: Annotated[int, Field(ge=0, le=10_000)]
@@ -41,19 +42,19 @@ def main(job: Job, params: Params) -> str:
     """Makes `views/` from the field, the poses, the images and the masks."""
     paths = job.paths
     views = read_transforms(paths.poses / "transforms.json")
-    records = [r for r in read_images_json(paths.images) if r.name in views]
-    # On a GPU the views queue up for the one device; on a CPU each core takes one.
-    workers = 1 if job.device != "cpu" else None
+    splits = ("train", "test") if params.views == "all" else ("test",)
+    records = [r for r in read_images_json(paths.images) if r.name in views and r.split in splits]
+    workers = 1 if job.device != "cpu" else None  # on a CPU each core takes a view
     how: dict[str, Any] = {"scheduler": job.scheduler, "workers": workers}
     load_field(paths.nerf, job.device)  # a missing field is told before the work begins
     with publish_dir(paths.views) as fresh:
         for folder in ("test", "input", "composite", "depth", "seen"):
             (fresh / folder).mkdir()
         fill = (params.feather_px, params.gain_px)
-        where = (paths.nerf, paths.images, paths.refine, fresh)
-        tasks = {r.name: (views[r.name], r.split, fill, job.device, *where) for r in records}
+        how_to = (job.device, paths.nerf, paths.images, paths.refine, fresh)
+        tasks = {r.name: (views[r.name], r.split, fill, *how_to) for r in records}
         map_named(_one_view, tasks, job_label="render", **how)
-        if params.seen_counts:
+        if params.seen_counts and params.views == "all":
             train = tuple(views[r.name] for r in records if r.split == "train")
             items = {r.name: (views[r.name], train, paths.refine, fresh) for r in records}
             write_json(fresh / "seen.json", map_named(_count_seen, items, job_label="seen", **how))

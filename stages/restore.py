@@ -14,7 +14,7 @@ from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.errors import UserError
 from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.images import read_image, write_image
-from pipeline.io.scene import read_images_json
+from pipeline.io.scene import read_images_json, write_images_json
 from pipeline.io.weights import fill, read_state
 from pipeline.parallel import map_named
 from pipeline.removal.autoencoder import ContextualAutoencoder
@@ -61,6 +61,7 @@ def main(job: Job, params: Params) -> str:
         map_named(clean_one, tasks, job_label="restore", scheduler=job.scheduler)
         about = {"method": params.method, "weights_sha256": digest, "images": names}
         write_json(fresh / "restored.json", about)
+        write_images_json(fresh, records)  # so that a fit can take these photos instead
     return f"{len(names)} photos restored by {params.method} in {job.paths.restored}"
 
 

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.errors import UserError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+SHARED = ("images", "attention", "masks", "poses", "refine")
 
 
 @dataclass(frozen=True)
 class ScenePaths:
     """The folders of one scene, and of one variant of its fit.
 
-    A variant shares images, attention, masks and poses with its scene and has a fit, views and
-    metrics of its own.
+    A variant shares images, attention, masks, poses and repaired masks with its scene and has a fit,
+    views and metrics of its own. `folders` says which of the shared ones it finds elsewhere among the
+    scene's artifacts: {"images": "attgan/restored"}.
     """
 
     root: Path
     scene: str
     variant: str | None = None
+    folders: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in (self.scene, self.variant):
@@ -30,6 +34,16 @@ class ScenePaths:
                     f"{name!r} cannot name a scene or a variant.",
                     "Use letters, digits, '.', '_' and '-', beginning with a letter or digit.",
                 )
+        for name, place in self.folders.items():
+            parts = place.split("/")
+            if name not in SHARED or not all(NAME.fullmatch(part) for part in parts):
+                raise UserError(
+                    f"a variant cannot find its {name} in {place!r}.",
+                    f"Folders may be named for {', '.join(SHARED)}, below the scene's artifacts.",
+                )
+
+    def _shared(self, name: str) -> Path:
+        return self.artifacts / self.folders.get(name, name)
 
     @property
     def data(self) -> Path:
@@ -46,24 +60,34 @@ class ScenePaths:
 
     @property
     def images(self) -> Path:
-        return self.artifacts / "images"
+        return self._shared("images")
 
     @property
     def attention(self) -> Path:
-        return self.artifacts / "attention"
+        return self._shared("attention")
 
     @property
     def masks(self) -> Path:
-        return self.artifacts / "masks"
+        return self._shared("masks")
 
     @property
     def poses(self) -> Path:
-        return self.artifacts / "poses"
+        return self._shared("poses")
 
     @property
     def refine(self) -> Path:
-        """Masks repaired from the scene, the ones that the fit uses; a variant may have its own."""
-        return self.artifacts / "refine"
+        """Masks repaired from the scene, the ones that the fit uses."""
+        return self._shared("refine")
+
+    @property
+    def unaveraged(self) -> Path:
+        """Masks of equation 3 alone, without the mean map; for the comparison of methods."""
+        return self.artifacts / "unaveraged"
+
+    @property
+    def small(self) -> Path:
+        """The scene at the size of the fits of a comparison of methods."""
+        return self.artifacts / "small"
 
     @property
     def out(self) -> Path:

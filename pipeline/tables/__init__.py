@@ -1,0 +1,1 @@
+"""The comparison of methods over scenes: pictures at the fits' size, statistics, tables, crops."""

@@ -1,0 +1,44 @@
+"""The scores of a scene's rows out of the metrics files that `evaluate` wrote."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.tables.rows import Row
+from pipeline.tables.statistics import mean
+
+NUMBERS = ("psnr", "ssim", "flip", "lpips")
+MASKS = ("precision", "recall", "iou")
+
+
+def view_scores(text: str, row: Row) -> dict[str, float]:
+    """The numbers of a row over the images of its split, from the text of a metrics.csv: means over images.
+
+    A number that any of these images lacks, or that is infinite for one, is left out.
+    """
+    images = [one for one in csv.DictReader(io.StringIO(text)) if one["split"] == row.split]
+    scores = {}
+    for number in NUMBERS:
+        words = [one.get(f"{row.kind}.{number}") or "nan" for one in images]
+        values = [float(word) for word in words]
+        if values and all(math.isfinite(value) for value in values):
+            scores[number] = mean(values)
+    return scores
+
+
+def mask_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Precision, recall and IoU of the masks that a row was fitted with, as far as they are known."""
+    return _known(metrics.get("masks", {}))
+
+
+def gathered_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The same of the masks gathered on the glass, before the loop's first fit; empty without a loop."""
+    return _known(metrics.get("rounds", {}).get("0", {}))
+
+
+def _known(numbers: Mapping[str, Any]) -> dict[str, float]:
+    return {name: float(numbers[name]) for name in MASKS if numbers.get(name) is not None}

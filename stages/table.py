@@ -1,0 +1,120 @@
+"""The comparison's tables and crops, out of the metrics of every scene, row and seed that there are."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.errors import UserError
+from pipeline.io.atomic import publish_dir, read_json, write_text
+from pipeline.io.images import read_image, write_image
+from pipeline.io.masks import read_keep_mask
+from pipeline.io.paths import ScenePaths
+from pipeline.io.scene import read_images_json
+from pipeline.stage import Job, Section, run
+from pipeline.tables import compose
+from pipeline.tables.crops import busiest_window, side_by_side
+from pipeline.tables.reading import gathered_scores, mask_scores, view_scores
+from pipeline.tables.rows import ROWS, Row
+from pipeline.tables.writers import as_csv, latex, markdown
+
+PICTURES = {
+    "NeRF": "nerf-{}", "AttGAN": "attgan", "Quan": "quan", "Wen": "wen", "no mean map": "unaveraged-{}",
+    "DerainNeRF": "derain-{}", "with the loop": "loop-{}", "true masks": "true-{}",
+}  # fmt: skip
+Found = dict[tuple[str, str, str], tuple[float, ...]]
+
+
+class Params(Section):
+    """The section `table` of params.yaml."""
+
+    title: str
+    scenes: list[str]
+    lens: list[str]
+    seeds: Annotated[list[int], Field(min_length=1)]
+    notes: list[str]
+
+
+def main(job: Job, params: Params) -> str:
+    """Makes `tables/`: each table as Markdown, CSV and LaTeX, and one strip of crops per scene."""
+    found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    missing: dict[tuple[str, str], str] = {}
+    poses, conventions = {}, {}
+    for scene in params.scenes:
+        for row in ROWS:
+            for seed in params.seeds if row.seeded else params.seeds[:1]:
+                paths = ScenePaths(job.root, scene, f"{row.key}-{seed}" if row.seeded else row.key)
+                if not paths.metrics.is_file():
+                    missing[scene, row.id] = _why(row, scene, params)
+                    continue
+                metrics = read_json(paths.metrics, made_by="evaluate")
+                poses[scene], conventions = metrics["poses"], metrics["conventions"]
+                scores = view_scores(paths.metrics_csv.read_text(encoding="utf-8"), row)
+                if row.id in ("unaveraged", "derain", "loop"):
+                    scores |= mask_scores(metrics)
+                for name, value in scores.items():
+                    found[scene, row.id, name].append(value)
+                for name, value in gathered_scores(metrics).items() if row.id == "loop" else ():
+                    found[scene, "gathered", name].append(value)
+    if not poses:
+        raise UserError("No row of the comparison has metrics yet.", "Run `make tables` first.")
+    scores_ = {key: tuple(values) for key, values in found.items()}
+    covered = float(conventions["mask_threshold"])
+    told = [*params.notes, *(f"{name}: {conventions[name]}." for name in ("psnr", "ssim", "flip"))]
+    told.append(_lpips(scores_, str(conventions["lpips_net"])))
+    tables = (
+        compose.comparison(scores_, params.scenes, missing, told),
+        compose.paper_comparison(),
+        compose.gains(scores_, params.scenes, missing),
+        compose.ablation(scores_, params.lens),
+        compose.mask_quality(scores_, params.scenes, missing, covered),
+        compose.pose_quality(poses, params.scenes),
+    )
+    with publish_dir(job.paths.artifacts / "tables") as fresh:
+        for table in tables:
+            write_text(fresh / f"{table.name}.csv", as_csv(table))
+            write_text(fresh / f"{table.name}.tex", latex(table))
+        pages = [f"# {params.title}\n", *(markdown(table) for table in tables)]
+        write_text(fresh / "tables.md", "\n".join(pages))
+        for scene in params.scenes:
+            _strip(ScenePaths(job.root, scene), params.seeds[0], fresh / f"{scene}.png")
+    runs = sum(len(values) for (_, _, name), values in scores_.items() if name == "psnr")
+    return f"{runs} scores, {len(missing)} cells without all of their runs, in {job.paths.artifacts}/tables"
+
+
+def _why(row: Row, scene: str, params: Params) -> str:
+    if row.key == "unaveraged" and scene not in params.lens:
+        return "equation 5 is for drops on the lens; without it the masks are those of the next row"
+    return "not computed"
+
+
+def _lpips(scores: Found, net: str) -> str:
+    if any(name == "lpips" for _, _, name in scores):
+        return f"LPIPS: {net}."
+    return f"LPIPS ({net}) is left out: its weights cannot be shipped; see evaluate.lpips_backbone."
+
+
+def _strip(paths: ScenePaths, seed: int, out: Path) -> None:
+    """The held-out view with the most water, there where it is."""
+    small = paths.small
+    records = [r for r in read_images_json(small / "images") if r.split == "test"]
+    water = {r.name: ~read_keep_mask(small / "true" / r.name, r.size) for r in records}
+    name = max(water, key=lambda one: float(water[one].mean()))
+    size = (water[name].shape[1] // 2, water[name].shape[0] // 2)
+    corner = busiest_window(water[name].astype(np.float32), size)
+    files = {"wet photo": small / "images" / name}
+    for label, variant in PICTURES.items():
+        files[label] = (
+            ScenePaths(paths.root, paths.scene, variant.format(seed)).views / "test" / name
+        )
+    files["clean photo"] = small / "clean" / name
+    pictures = {label: read_image(path) for label, path in files.items() if path.is_file()}
+    write_image(out, side_by_side(pictures, corner, size, scale=2 if size[0] <= 100 else 1))
+
+
+if __name__ == "__main__":
+    run("table", Params, main)
