@@ -74,7 +74,7 @@ def main(job: Job, params: Params) -> str:
         compose.mask_quality(scores_, params.scenes, missing, covered),
         compose.pose_quality(poses, params.scenes),
     )
-    with publish_dir(job.paths.artifacts / "tables") as fresh:
+    with publish_dir(job.paths.tables) as fresh:
         for table in tables:
             write_text(fresh / f"{table.name}.csv", as_csv(table))
             write_text(fresh / f"{table.name}.tex", latex(table))
@@ -83,7 +83,7 @@ def main(job: Job, params: Params) -> str:
         for scene in params.scenes:
             _strip(ScenePaths(job.root, scene), params.seeds[0], fresh / f"{scene}.png")
     runs = sum(len(values) for (_, _, name), values in scores_.items() if name == "psnr")
-    return f"{runs} scores, {len(missing)} cells without all of their runs, in {job.paths.artifacts}/tables"
+    return f"{runs} scores, {len(missing)} cells without all of their runs, in {job.paths.tables}"
 
 
 def _why(row: Row, scene: str, params: Params) -> str:

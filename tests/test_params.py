@@ -7,7 +7,15 @@ import pytest
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.params import Section, read_params, read_section, stage_names, with_scene
+from pipeline.io.paths import ScenePaths
+from pipeline.params import (
+    Section,
+    read_folders,
+    read_params,
+    read_section,
+    stage_names,
+    with_scene,
+)
 
 
 class Masks(Section):
@@ -122,3 +130,30 @@ def test_a_scene_that_cannot_be_added_is_told_with_the_line_to_write(
     """A flow mapping, no anchor, no scenes."""
     with pytest.raises(UserError, match=r"garden: \{<<: \*scene\}"):
         with_scene(_file(tmp_path, text), "garden")
+
+
+def test_a_file_may_build_on_another(tmp_path: Path) -> None:
+    """Key by key within a section; scenes and variants are added to those of the base."""
+    _file(tmp_path)
+    above = tmp_path / "sub" / "params.yaml"
+    above.parent.mkdir()
+    above.write_text("base: ../params.yaml\nscenes: {pier: {}}\nmasks: {dilation: 7}\n")
+    for scene in ("pier", "demo"):
+        params = read_section(above, "masks", Masks, scene)
+        assert (params.threshold, params.dilation) == (0.3, 7)
+    above.write_text("base: nowhere.yaml\n")
+    with pytest.raises(UserError, match=r"nowhere\.yaml cannot be read"):
+        read_params(above)
+
+
+def test_a_variant_may_find_folders_elsewhere(tmp_path: Path) -> None:
+    text = GOOD.replace("wide: {", "wide: {folders: {images: other/photos}, ")
+    file = _file(tmp_path, text)
+    assert read_folders(file, "wide") == {"images": "other/photos"}
+    assert read_folders(file, None) == {}
+    paths = ScenePaths(tmp_path, "demo", "wide", read_folders(file, "wide"))
+    assert paths.images == tmp_path / "artifacts/demo/other/photos"
+    assert paths.masks == tmp_path / "artifacts/demo/masks"
+    for folders in ({"images": "../../elsewhere"}, {"nerf": "a"}, {"masks": "/etc"}):
+        with pytest.raises(UserError, match="cannot find its"):
+            ScenePaths(tmp_path, "demo", "wide", folders)

@@ -90,6 +90,11 @@ class ScenePaths:
         return self.artifacts / "small"
 
     @property
+    def tables(self) -> Path:
+        """The tables of a comparison of methods, over all scenes."""
+        return self.root / "tables"
+
+    @property
     def out(self) -> Path:
         """The scene's own folder, or its variant's."""
         return self.artifacts / self.variant if self.variant else self.artifacts

@@ -35,11 +35,11 @@ def side_by_side(
     for label, rgb in pictures.items():
         crop = np.ascontiguousarray(rgb[y : y + h, x : x + w], np.float32)
         large = cv2.resize(crop, (w * scale, h * scale), interpolation=cv2.INTER_NEAREST)
-        head = np.ones((LABEL_HEIGHT, w * scale, 3), np.float32)
+        head = np.full((LABEL_HEIGHT, w * scale, 3), 255, np.uint8)  # OpenCV letters 8 bits only
         cv2.putText(
             head, label, (3, LABEL_HEIGHT - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1,
             cv2.LINE_AA,
         )  # fmt: skip
-        parts.append(np.vstack([head, large]))
+        parts.append(np.vstack([head.astype(np.float32) / 255, large]))
         parts.append(np.ones((parts[-1].shape[0], GAP, 3), np.float32))
     return np.hstack(parts[:-1])

@@ -1,0 +1,99 @@
+"""The comparison's DAG: valid in every profile, and true to what its stages import and read."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from experiments.tables.run import PROFILES, phases
+from pipeline.params import read_folders, read_params, read_section, stage_names
+from pipeline.tables.rows import ROWS
+from tests.test_architecture import true_code_dependencies
+
+TABLES = Path(__file__).resolve().parents[2] / "experiments/tables"
+DAG: dict[str, dict[str, Any]] = yaml.safe_load((TABLES / "stages.yaml").read_text())["stages"]
+UP = "../../../"
+
+
+def stages_of(entry: dict[str, Any]) -> set[str]:
+    words = [
+        word
+        for command in entry["cmd"]
+        if command.startswith("${steps}")
+        for word in command.removeprefix("${steps}").split("--")[0].split()
+    ]
+    return set(words)
+
+
+@pytest.mark.parametrize("name", DAG)
+def test_code_dependencies_are_what_the_stages_import(name: str) -> None:
+    stages = stages_of(DAG[name])
+    assert stages <= set(stage_names())
+    code = {f"stages/{stage}.py" for stage in stages}
+    code |= {path for stage in stages for path in true_code_dependencies(stage)}
+    listed = {dep.removeprefix(UP) for dep in DAG[name]["deps"] if dep.startswith(UP)}
+    assert {path for path in listed if path.startswith(("pipeline/", "stages/"))} == code
+
+
+@pytest.mark.parametrize("name", DAG)
+def test_every_section_that_the_stages_read_is_followed(name: str) -> None:
+    keys = {file: set(some) for entry in DAG[name]["params"] for file, some in entry.items()}
+    assert keys[f"{UP}params.yaml"] == stages_of(DAG[name])
+    for file, place in (("../params.yaml", TABLES), ("params.yaml", TABLES / "quick")):
+        own = yaml.safe_load((place / "params.yaml").read_text())
+        assert keys.get(file, set()) >= stages_of(DAG[name]) & set(own)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_is_complete(profile: str) -> None:
+    """Every section of every scene and variant validates, and the paths of variants are told."""
+    file = TABLES / profile / "params.yaml"
+    assert (TABLES / profile / "dvc.yaml").resolve() == TABLES / "stages.yaml"
+    content = read_params(file)
+    comparison = content["comparison"]
+    table = importlib.import_module("stages.table").Params
+    params = read_section(file, "table", table, "all")
+    assert (params.scenes, params.lens, params.seeds) == tuple(
+        comparison[key] for key in ("scenes", "lens", "seeds")
+    )
+    variants = {f"{row.key}-{s}" if row.seeded else row.key for row in ROWS for s in params.seeds}
+    for scene in params.scenes:
+        for variant in variants | {"unaveraged"}:
+            assert variant == "unaveraged" or read_folders(file, variant)
+            for stage in ("masks", "restore", "refine", "nerf", "render", "evaluate", "shrink"):
+                section = importlib.import_module(f"stages.{stage}").Params
+                read_section(file, stage, section, scene, variant)
+
+
+def test_variants_of_a_row_differ_in_their_seed_alone() -> None:
+    variants = read_params(TABLES / "quick/params.yaml")["variants"]
+    for row in ROWS:
+        if row.seeded:
+            texts = set()
+            for seed in range(3):
+                assert variants[f"{row.key}-{seed}"]["nerf"]["seed"] == seed
+                text = str(variants[f"{row.key}-{seed}"])
+                texts.add(re.sub(rf"('seed': |loop-){seed}", r"\1N", text))
+            assert len(texts) == 1
+    assert variants["clean-0"]["folders"]["images"] == "small/clean"
+    assert variants["on-wen-1"]["nerf"]["use_masks"] is False
+
+
+def test_one_seed_of_everything_comes_before_the_next() -> None:
+    targets = [
+        "prepare@a", "restore@a-wen", "restore@a-quan", "fit@a-nerf-0", "fit@a-nerf-1",
+        "loop@a-0", "loop@a-1", "cleaned@a-wen-0", "cleaned@a-wen-1", "table",
+    ]  # fmt: skip
+    assert [some for _, some in phases(targets)] == [
+        ["prepare@a"],
+        ["fit@a-nerf-0", "loop@a-0"],
+        ["restore@a-quan", "restore@a-wen"],
+        ["cleaned@a-wen-0"],
+        ["fit@a-nerf-1", "loop@a-1"],
+        ["cleaned@a-wen-1"],
+    ]
