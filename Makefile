@@ -4,7 +4,7 @@ SCENE ?= demo
 BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 
-.PHONY: demo test check format setup scene report synth clean
+.PHONY: demo test check format setup scene tables report synth clean
 
 demo: setup
 	dvc repro --glob '*@demo*'
@@ -29,6 +29,10 @@ scene: setup
 	dvc repro --glob '*@$(SCENE)'
 	@python -m pipeline.evaluation.table artifacts/$(SCENE)/metrics.json
 	@echo "Open $(abspath artifacts/$(SCENE)/report/index.html)"
+
+# make tables PROFILE=quick: every method on every scene, see experiments/tables/README.md
+tables: setup
+	python -m experiments.tables.run $(or $(PROFILE),quick)
 
 setup: $(VENV)/.ready
 	@if [ ! -e .git ]; then dvc config --local core.no_scm true; fi
