@@ -47,7 +47,8 @@ def phases(targets: Sequence[str]) -> list[tuple[str, list[str]]]:
 def _environment() -> dict[str, str]:
     one = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     path = os.pathsep.join(filter(None, (str(Path(sys.executable).parent), os.environ.get("PATH"))))
-    return {**os.environ, **one, "PATH": path, "PYTHONPATH": str(ROOT)}
+    # Two progress bars in one terminal are none.
+    return {**os.environ, **one, "PATH": path, "PYTHONPATH": str(ROOT), "TQDM_DISABLE": "1"}
 
 
 def _dvc(*words: str) -> list[str]:
