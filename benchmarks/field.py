@@ -1,7 +1,7 @@
 """Rays per second and PSNR over time: the fast field and the paper's NeRF, on one core and two.
 
     python -m benchmarks.field                     # about four minutes
-    python -m benchmarks.field --seconds 60 --paper-seconds 600
+    python -m benchmarks.field --width 100 --seconds 5 --paper-seconds 300 --paper-views 1
 
 The scene is cast here: textured boxes, 24 views, exact poses, every eighth view held out. Times are
 wall times of the fit alone, beside the processor's time per step; the machine should be idle.
@@ -27,7 +27,7 @@ from scene import camera, photograph  # noqa: E402
 from pipeline.field.buffer import PosedPhoto, RayBuffer  # noqa: E402
 from pipeline.field.fit import fit  # noqa: E402
 from pipeline.field.grid_field import GridField  # noqa: E402
-from pipeline.field.model import build, grid_sizes, scene_space  # noqa: E402
+from pipeline.field.model import build, grid_sizes, half_is_fast, scene_space  # noqa: E402
 from pipeline.field.paper_field import PaperField  # noqa: E402
 from pipeline.field.render import render_view  # noqa: E402
 
@@ -73,16 +73,23 @@ def photos_and_field(
     if model == "fast":
         same = ("samples", "levels", "features", "table_log2", "distortion")
         config = {k: settings[k] for k in same} | grid_sizes(space, settings["resolution"])
+        config["half"] = half_is_fast()
     field = build(model, config, space, settings["seed"])
     return [p for i, p in enumerate(photos) if i % 8], photos[::8], field
 
 
 def measure(
-    model_name: str, threads: int, seconds: float, steps: int, batch: int, held_out_views: int
+    model_name: str,
+    threads: int,
+    seconds: float,
+    steps: int,
+    batch: int,
+    held_out_views: int,
+    size: tuple[int, int],
 ) -> Row:
     """Fit for ``seconds`` of wall time on a schedule of ``steps``, then render and compare."""
     settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
-    train, test, model = photos_and_field(model_name, settings)
+    train, test, model = photos_and_field(model_name, settings, size=size)
     buffer = RayBuffer(train, 0)
     buffer.batch(0, batch)  # the first epoch is shuffled before the clock starts
     begin, cpu, done = time.perf_counter(), time.process_time(), 0
@@ -103,7 +110,7 @@ def measure(
     torch.set_num_threads(threads)
     begin, errors = time.perf_counter(), []
     for photo in test[:held_out_views]:
-        view = render_view(model, photo.cam_from_world, photo.intrinsics, SIZE, NEAR, FAR)
+        view = render_view(model, photo.cam_from_world, photo.intrinsics, size, NEAR, FAR)
         errors.append(-10 * np.log10(float(((view.rgb - photo.image) ** 2).mean())))
     each = (time.perf_counter() - begin) / max(1, len(errors))
     psnr = float(np.mean(errors)) if errors else float("nan")
@@ -116,8 +123,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, nargs="+", default=[5.0, 10.0, 20.0, 40.0])
     parser.add_argument("--paper-seconds", type=float, default=30.0)
     parser.add_argument("--paper-views", type=int, default=0, help="held-out views it renders")
-    parser.add_argument("--steps-per-second", type=float, default=11.0, help="of one thread")
+    parser.add_argument("--steps-per-second", type=float, default=20.0, help="of one thread")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--width", type=int, default=SIZE[0], help="of the photos, in pixels")
     flags = parser.parse_args()
+    size = (flags.width, flags.width * 3 // 4)
     print(f"{'model':6} {'threads':>7} {'steps':>6} {'fit s':>7} {'cpu ms/step':>11} "
           f"{'rays/s':>9} {'PSNR dB':>8} {'s/view':>7}")  # fmt: skip
     jobs = [
@@ -128,13 +138,14 @@ def main() -> None:
             max(50, int(seconds * flags.steps_per_second * (1 if threads == 1 else 1.7))),
             4096,
             3,
+            size,
         )
         for seconds in flags.seconds
-        for threads in (1, 2)
+        for threads in flags.threads
     ]
     jobs += [
-        ("paper", threads, flags.paper_seconds, 200_000, 1024, flags.paper_views)
-        for threads in (1, 2)
+        ("paper", threads, flags.paper_seconds, 200_000, 1024, flags.paper_views, size)
+        for threads in flags.threads
     ]
     for job in jobs:
         row = measure(*job)

@@ -24,8 +24,9 @@ import torch
 import yaml
 
 from benchmarks.field import FAR, NEAR, photos_and_field
+from pipeline.field import fused
 from pipeline.field.buffer import RayBuffer
-from pipeline.field.encoding import add_rows, cell_corners, gather
+from pipeline.field.encoding import add_rows, gather
 from pipeline.field.fit import fit
 from pipeline.field.render import render_view
 
@@ -43,10 +44,10 @@ def best(work: Callable[[], Any], repeats: int = 7) -> float:
     return min(times)
 
 
-def machine() -> tuple[float, float]:
-    """Measured floating-point operations and bytes per second of one thread."""
-    a = torch.randn(32768, 64)
-    b = torch.randn(64, 64)
+def machine(kind: torch.dtype) -> tuple[float, float]:
+    """Measured floating-point operations of this kind and bytes per second of one thread."""
+    a = torch.randn(32768, 64).to(kind)
+    b = torch.randn(64, 64).to(kind)
     flops = 2 * a.shape[0] * 64 * 64 / best(lambda: a @ b)
     big = torch.zeros(16_000_000)
     target = torch.empty_like(big)
@@ -56,11 +57,11 @@ def machine() -> tuple[float, float]:
 
 def stages(settings: dict[str, Any]) -> None:
     """Milliseconds of each part of one step, beside its floor."""
-    flops, bandwidth = machine()
-    print(
-        f"one thread: {flops / 1e9:.0f} GFLOP/s (32768x64 by 64x64), {bandwidth / 1e9:.1f} GB/s (copy)"
-    )
     train, _, model = photos_and_field("fast", settings)
+    half = model.config.half
+    flops, bandwidth = machine(torch.bfloat16 if half else torch.float32)
+    print(f"one thread: {flops / 1e9:.0f} GFLOP/s (32768x64 by 64x64, "
+          f"{'bfloat16' if half else 'float32'}), {bandwidth / 1e9:.1f} GB/s (copy)")  # fmt: skip
     buffer = RayBuffer(train, 0)
     rays_per_step, samples = settings["batch_rays"], model.config.samples
     count, levels = rays_per_step * samples, model.config.levels
@@ -68,14 +69,33 @@ def stages(settings: dict[str, Any]) -> None:
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(3, count, generator=generator)
     grid, hidden = model.grid, model.config.hidden
-    corners = [cell_corners(x, r, s) for r, s in zip(grid.resolutions, grid.sizes, strict=True)]
+    levels_of = list(zip(grid.resolutions, grid.sizes, strict=True))
+    corners = [fused.cell_corners(x, r, s) for r, s in levels_of]
     features = torch.randn(count, levels * model.config.features)
     gradient = torch.randn(count, model.config.features)
     row_bytes = max(LINE, 4 * model.config.features)
 
+    network = [model.shape_in.weight, model.shape_in.bias, model.shape_out.weight,
+               model.shape_out.bias, model.shape_skip.weight]  # fmt: skip
+    upstream = torch.randn(count, 16)
+
     def head() -> None:
-        shape = model.shape_out(torch.relu(model.shape_in(leaf)))
-        torch.autograd.grad(shape.sum(), [leaf, *model.shape_in.parameters()])
+        shape = fused.shape_network(leaf, half, *network)
+        torch.autograd.grad(shape, [leaf, *network], upstream)
+
+    proposed = torch.rand(rays_per_step, model.config.bins, generator=generator)
+
+    def sample() -> None:
+        u = torch.rand(rays_per_step, samples, generator=generator).sort(-1).values
+        edges = fused.drawn_edges(proposed, u)
+        fused.middles(fused.walk(model.space, *rays, edges))
+
+    shaped = torch.randn(rays_per_step, samples, 16).requires_grad_()
+    lengths = torch.rand(rays_per_step, samples)
+
+    def along() -> None:
+        weights, seen = fused.along_rays(shaped, lengths, 12.0)
+        torch.autograd.grad((weights.sum(), seen.sum()), shaped)
 
     leaf = features.requires_grad_()
     table = sum(t.numel() for t in grid.tables)
@@ -92,8 +112,8 @@ def stages(settings: dict[str, Any]) -> None:
             add_rows(rows, weights, gradient, size)
 
     def place() -> None:
-        for r, s in zip(grid.resolutions, grid.sizes, strict=True):
-            cell_corners(x, r, s)
+        for r, s in levels_of:
+            fused.cell_corners(x, r, s)
 
     bins = model.config.bins
     lookups = count * 8 * levels
@@ -101,11 +121,14 @@ def stages(settings: dict[str, Any]) -> None:
         ("batch of rays", lambda: buffer.batch(1, rays_per_step), 0, rays_per_step * 60),
         ("proposal, forward", lambda: model._propose(rays, generator, []), 0,
          rays_per_step * bins * (LINE + 40)),
+        ("samples along rays", sample, 0, count * 6 * 4),
         ("corners and weights", place, 0, lookups * 8),
         ("read rows", read, 0, lookups * (row_bytes + 8)),
         ("add rows", add, 0, lookups * (2 * row_bytes + 8)),
         ("shape network, both ways", head,
-         3 * 2 * count * hidden * (levels * model.config.features + 16), 0),
+         3 * 2 * count * (hidden * (levels * model.config.features + 16)
+                          + levels * model.config.features * 16), 0),
+        ("weights, features to rays", along, 0, count * 16 * 4 * 3),
         ("Adam, tables", lambda: adam.step(), 0, table * 4 * 7),
     ]  # fmt: skip
     print(f"{'stage':26} {'ms':>7} {'floor ms':>9} {'times':>6}")
