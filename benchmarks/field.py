@@ -71,7 +71,7 @@ def photos_and_field(
     space = scene_space("ndc", cams, numbers, sizes, NEAR, FAR)
     config = {}
     if model == "fast":
-        same = ("samples", "levels", "features", "table_log2", "distortion")
+        same = ("samples", "levels", "features", "table_log2", "distortion", "decay")
         config = {k: settings[k] for k in same} | grid_sizes(space, settings["resolution"])
         config["half"] = half_is_fast()
     field = build(model, config, space, settings["seed"])

@@ -57,6 +57,7 @@ FIELD = (
     "table_log2",
     "distortion",
     "trim",
+    "decay",
     "resolution",
     "seed",
     "space",

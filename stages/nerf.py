@@ -20,7 +20,7 @@ from pipeline.stage import Job, Section, run
 
 SETTINGS = {
     "space", "seed", "resolution", "samples", "levels", "features", "table_log2", "distortion",
-    "trim", "precision",
+    "trim", "decay", "precision",
 }  # fmt: skip
 
 
@@ -41,6 +41,7 @@ class Params(Section):
     resolution: Annotated[int, Field(ge=32, le=8192)]
     distortion: Annotated[float, Field(ge=0, le=1)]
     trim: Annotated[float, Field(ge=0, le=0.5)]
+    decay: Annotated[float, Field(ge=0, le=1)]
     rate: Annotated[float, Field(gt=0, le=10)]
     precision: Literal["auto", "float32", "bfloat16"]
     exposure: bool

@@ -42,8 +42,8 @@ class Rendering(NamedTuple):
 class Part:
     """Parameters that are stepped together, with Adam's settings for them.
 
-    ``rate`` falls exponentially to ``rate * final`` over the fit, after ``warmup`` steps; ``every``
-    says how often the part has a gradient, after ``always_until`` steps.
+    ``rate`` falls exponentially to ``rate * final`` over the fit, after ``warmup`` steps. Every step
+    shrinks the parameters by ``decay`` times the rate (AdamW, arXiv:1711.05101).
     """
 
     name: str
@@ -53,6 +53,7 @@ class Part:
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-8
     warmup: int = 0
+    decay: float = 0.0
 
 
 class Field(Protocol):

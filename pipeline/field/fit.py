@@ -66,8 +66,13 @@ class Stepper:
     ) -> None:
         self.part, self.parameters, self.steps = part, parameters, steps
         self.rate = part.rate * rate
-        self.adam = torch.optim.Adam(
-            parameters, lr=self.rate, betas=part.betas, eps=part.eps, fused=True
+        self.adam = torch.optim.AdamW(
+            parameters,
+            lr=self.rate,
+            betas=part.betas,
+            eps=part.eps,
+            weight_decay=part.decay,
+            fused=True,
         )
 
     def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
@@ -129,6 +134,8 @@ def fit(
     light = Exposure(buffer.photos).to(buffer.device) if exposure else None
     learned = [model] if light is None else [model, light]
     steppers = [stepper for module in learned for stepper in _steppers(module, steps, rate)]
+    # The largest first: two threads then finish at about the same time.
+    steppers.sort(key=lambda stepper: -sum(one.numel() for one in stepper.parameters))
     record = Record()
     running: list[Tensor] = []
     first = 0

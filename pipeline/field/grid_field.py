@@ -47,6 +47,7 @@ class GridConfig:
     proposal: tuple[int, int, int] = (96, 72, 64)
     distortion: float = 0.0
     trim: float = 0.0
+    decay: float = 0.0
     half: bool = False
 
 
@@ -110,9 +111,9 @@ class GridField(nn.Module):
 
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""
-        betas = (0.9, 0.99)
+        betas, decay = (0.9, 0.99), self.config.decay
         tables = [
-            Part(f"grid.tables.{i}", (f"grid.tables.{i}",), 4e-2, 0.03, betas, 1e-15, 50)
+            Part(f"grid.tables.{i}", (f"grid.tables.{i}",), 4e-2, 0.03, betas, 1e-15, 50, decay)
             for i in range(len(self.grid.tables))
         ]
         head = tuple(

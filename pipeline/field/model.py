@@ -64,7 +64,11 @@ def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:
             depth,
         )
 
-    return {"coarse": across(24, 16), "fine": across(fine, fine // 8), "proposal": across(96, 64)}
+    return {
+        "coarse": across(24, 16),
+        "fine": across(fine, max(16, fine // 12)),
+        "proposal": across(96, 64),
+    }
 
 
 def half_is_fast() -> bool:
