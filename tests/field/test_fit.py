@@ -12,10 +12,11 @@ import torch
 import yaml
 
 from pipeline.errors import UserError
+from pipeline.field.base import Part
 from pipeline.field.buffer import Batch, PosedPhoto, RayBuffer
-from pipeline.field.fit import fit
+from pipeline.field.fit import Stepper, fit
 from pipeline.field.grid_field import GridConfig, GridField
-from pipeline.field.model import describe, restore, scene_space
+from pipeline.field.model import build_around, describe, restore, scene_space
 from pipeline.field.render import render_view
 from pipeline.field.store import Checkpoint
 
@@ -183,6 +184,35 @@ def test_the_rate_scales_every_step(photos: list[PosedPhoto]) -> None:
         fit(model, RayBuffer(photos, 0), steps=1, batch_rays=256, seed=0, rate=rate)
         moved.append((model.colour_out.bias - start.colour_out.bias).abs().max().item())
     assert moved[1] == pytest.approx(moved[0] / 4, rel=1e-3)
+
+
+def test_decay_shrinks_by_its_share_of_the_rate() -> None:
+    """No gradient: ten steps at a constant rate of 0.1 leave (1 - 0.1 * 0.5)^10 of each parameter."""
+    table = torch.nn.Parameter(torch.tensor([2.0, -1.0]))
+    part = Part("table", ("table",), rate=0.1, final=1.0, decay=0.5)
+    stepper = Stepper(part, [table], steps=10)
+    for step in range(10):
+        stepper.step(step, [torch.zeros(2)])
+    torch.testing.assert_close(table.detach(), torch.tensor([2.0, -1.0]) * 0.95**10)
+
+
+@pytest.mark.parametrize(("precision", "half"), [("float32", False), ("bfloat16", True)])
+def test_products_are_of_the_precision_asked_for(
+    photos: list[PosedPhoto], precision: str, half: bool
+) -> None:
+    class Camera:
+        def __init__(self, photo: PosedPhoto) -> None:
+            self.cam_from_world, self.intrinsics = photo.cam_from_world, photo.intrinsics
+            self.height, self.width = photo.keep_mask.shape
+
+    cameras = [Camera(photo) for photo in photos]
+    model = build_around(
+        "fast", cameras, NEAR, FAR, resolution=32, table_log2=10, precision=precision
+    )
+    assert isinstance(model, GridField)
+    assert model.config.half is half
+    record = fit(model, RayBuffer(photos, 0), steps=30, batch_rays=256, seed=0, log_every=10)
+    assert record.rows[-1][2] > record.rows[0][2] + 0.5
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_and_knob(photos: list[PosedPhoto]) -> None:
