@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -60,7 +61,10 @@ def _repro(folder: Path, targets: Sequence[str]) -> None:
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     running = []
     for worker in range(min(cores(), len(targets))):
-        command = _dvc("repro", "--quiet", "--keep-going", *targets[worker :: cores()])
+        # They share one repository, whose lock is held while a result is written down.
+        command = _dvc(
+            "--wait-for-lock", "repro", "--quiet", "--keep-going", *targets[worker :: cores()]
+        )
 
         def pinned(core: int = worker) -> None:
             if usable:
@@ -77,6 +81,7 @@ def _repro(folder: Path, targets: Sequence[str]) -> None:
 
 def main() -> int:
     """Runs the phases; 1 when the last tables could not be made by DVC, that is, when something failed."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=PROFILES)
     folder = HERE / parser.parse_args().profile
