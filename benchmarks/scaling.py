@@ -57,7 +57,7 @@ def machine(kind: torch.dtype) -> tuple[float, float]:
 
 def stages(settings: dict[str, Any]) -> None:
     """Milliseconds of each part of one step, beside its floor."""
-    train, _, model = photos_and_field("fast", settings)
+    train, _, model = photos_and_field("fast", settings, views=4)
     half = model.config.half
     flops, bandwidth = machine(torch.bfloat16 if half else torch.float32)
     print(f"one thread: {flops / 1e9:.0f} GFLOP/s (32768x64 by 64x64, "
