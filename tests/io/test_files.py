@@ -151,6 +151,18 @@ def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
         read_transforms(tmp_path / "t.json")
 
 
+def test_a_narrow_video_is_the_same_whatever_was_in_memory(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    frames = [rng.random((37, 50, 3)).astype(np.float32) for _ in range(24)]
+    made = set()
+    for k in range(20):
+        write_video(tmp_path / "other.mp4", [np.full((45, 60 + 2 * k, 3), k / 20)] * 2, fps=10)
+        write_video(tmp_path / "a.mp4", frames, fps=10)
+        made.add((tmp_path / "a.mp4").read_bytes())
+    assert len(made) == 1
+
+
 def test_a_video_has_every_frame_even_sides_and_the_same_bytes(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:

@@ -90,7 +90,9 @@ def test_every_photo_is_restored(scene: Path) -> None:
     torch.save({"state_dict": whole}, scene / "gen.pkl")
     assert run_stage(scene, "gen.safetensors") == 0
     out = scene / "artifacts/glass/restored"
-    assert sorted(path.name for path in out.iterdir()) == ["a.png", "b.png", "restored.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "a.png", "b.png", "images.json", "restored.json",
+    ]  # fmt: skip
     first = read_image(out / "a.png")
     assert first.shape == (24, 32, 3)
     assert run_stage(scene, "gen.pkl") == 0
