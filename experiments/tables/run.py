@@ -61,10 +61,10 @@ def _repro(folder: Path, targets: Sequence[str]) -> None:
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     running = []
     for worker in range(min(cores(), len(targets))):
-        # They share one repository, whose lock is held while a result is written down.
-        command = _dvc(
-            "--wait-for-lock", "repro", "--quiet", "--keep-going", *targets[worker :: cores()]
-        )
+        # They share one repository, whose lock is held while a result is written down. What a target
+        # needs was made in an earlier phase; to check it again DVC would lock it against the other worker.
+        command = _dvc("--wait-for-lock", "repro", "--single-item", "--keep-going", "--quiet")
+        command += targets[worker :: cores()]
 
         def pinned(core: int = worker) -> None:
             if usable:
@@ -90,11 +90,16 @@ def main() -> int:
     )
     start = time.monotonic()
     table = [sys.executable, "-m", "stages.table", "--scene", "all"]
+    scenes = sorted({name.split("@")[1] for name in listed.stdout.split() if "prepare@" in name})
+    rendered = [f"../../scenes/dvc.yaml:scene@{scene}" for scene in scenes]
+    subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=folder, check=True)
     for what, targets in phases(listed.stdout.split()):
         print(f"[{(time.monotonic() - start) / 60:5.1f} min] {what}: {len(targets)}", flush=True)
         _repro(folder, targets)
         subprocess.run(table, cwd=folder, env=_environment(), check=False)
-    done = subprocess.run(_dvc("repro", "--quiet", "table"), cwd=folder, env=_environment())
+    done = subprocess.run(
+        _dvc("repro", "--quiet", "--single-item", "table"), cwd=folder, env=_environment()
+    )
     print(f"[{(time.monotonic() - start) / 60:5.1f} min] {folder / 'tables' / 'tables.md'}")
     return 1 if done.returncode else 0
 
