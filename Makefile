@@ -35,7 +35,8 @@ tables: setup
 	python -m experiments.tables.run $(or $(PROFILE),quick)
 
 setup: $(VENV)/.ready
-	@if [ ! -e .git ]; then dvc config --local core.no_scm true; fi
+	@if [ ! -e .git ]; then for of in . experiments/scenes experiments/tables/*/; do \
+	    (cd $$of && dvc config --local core.no_scm true); done; fi
 
 $(VENV)/.ready: pyproject.toml constraints.txt
 	python3 -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed")'
