@@ -6,7 +6,6 @@ in the scene it keeps its place on a plane. Maps of several views are averaged t
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 from collections.abc import Sequence
@@ -14,7 +13,6 @@ from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
-import scipy.fft
 import torch
 
 from pipeline.geometry.poses import invert
@@ -22,7 +20,6 @@ from pipeline.geometry.rays import pixel_rays
 from pipeline.geometry.spaces import mean_camera
 
 MAX_CELLS = 1_000_000
-ALIGN_CELLS = 120_000
 
 
 class GlassCamera(NamedTuple):
@@ -86,10 +83,12 @@ class PaneGlass:
         self.normal = normal if offset > 0 else -normal
         if abs(offset) < 1e-12 or self.normal[2] <= 0:
             raise ValueError("the mean camera looks away from the plane")
-        self.views_from_glass = [
-            abs(offset) * moved[:3, :3] + np.outer(moved[:3, 3], self.normal)
-            for moved in (camera.cam_from_world @ invert(mean) for camera in cameras)
-        ]
+        self.depth = abs(offset)
+        self.from_mean = [camera.cam_from_world @ invert(mean) for camera in cameras]
+        self.pane_from_world = pane_from_world
+        # What to add to each view's translation for the plane's sake, in the world's units and axes: poses
+        # good enough for the scene may be centimetres off for a pane close by.
+        self.moved = np.zeros((len(self.cameras), 3))
         spots = [
             places[ahead]
             for view, camera in enumerate(self.cameras)
@@ -105,21 +104,23 @@ class PaneGlass:
         self.cell = pixel * max(1.0, math.sqrt(float(extent.prod()) / pixel**2 / max_cells))
         columns, rows = np.ceil(extent / self.cell).astype(int)
         self.shape = (int(rows), int(columns))
-        # How far (x, y) each view's picture of the plane lies off the others', in the mean camera's units:
-        # poses that are good enough for the scene may be centimetres off for a pane close by.
-        self.offsets = np.zeros((len(self.cameras), 2))
+
+    def view_from_glass(self, view: int) -> np.ndarray:
+        """(3, 3): the homography from the plane, as the mean camera sees it, to the view."""
+        pose = self.from_mean[view]
+        moved = self.cameras[view].cam_from_world[:3, :3] @ self.moved[view]
+        return self.depth * pose[:3, :3] + np.outer(pose[:3, 3] + moved, self.normal)
 
     def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
         """See :class:`Glass`."""
         camera = self.cameras[view]
         fx, fy, cx, cy, k1 = camera.intrinsics
-        start = self.low + self.offsets[view]
-        across = (start[0] + (np.arange(self.shape[1]) + 0.5) * self.cell)[None, :]
-        down = (start[1] + (np.arange(self.shape[0]) + 0.5) * self.cell)[:, None]
+        across = (self.low[0] + (np.arange(self.shape[1]) + 0.5) * self.cell)[None, :]
+        down = (self.low[1] + (np.arange(self.shape[0]) + 0.5) * self.cell)[:, None]
         across, down = across.astype(np.float32), down.astype(np.float32)
         x, y, z, front = (
             np.float32(row[0]) * across + (np.float32(row[1]) * down + np.float32(row[2]))
-            for row in (*self.views_from_glass[view], self.normal)
+            for row in (*self.view_from_glass(view), self.normal)
         )
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = x / z, y / z
@@ -135,14 +136,14 @@ class PaneGlass:
         camera = self.cameras[view]
         rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
         spots, ahead = self._on_glass(view, _directions(camera.intrinsics, columns, rows))
-        cells = (spots - self.low - self.offsets[view]) / self.cell - 0.5
+        cells = (spots - self.low) / self.cell - 0.5
         cells[~ahead] = -1e6
         x, y = cells.astype(np.float32).T.reshape(2, camera.height, camera.width)
         return _sample(values, x, y)
 
     def _on_glass(self, view: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where a view's rays (3, N) meet the plane, as the mean camera sees it: (N, 2), and which do."""
-        spots = np.linalg.inv(self.views_from_glass[view]) @ directions
+        spots = np.linalg.inv(self.view_from_glass(view)) @ directions
         with np.errstate(divide="ignore", invalid="ignore"):
             places = (spots[:2] / spots[2]).T
         # Depths in the view and in the mean camera: both in front.
@@ -176,54 +177,6 @@ def pane_depths(pane_from_world: np.ndarray, camera: GlassCamera) -> tuple[float
         depth = -pane_from_cam[2, 3] / along
     depth = depth[np.isfinite(depth) & (depth > 0)]
     return (float(depth.min()), float(depth.max())) if depth.size else (math.inf, math.inf)
-
-
-def aligned(
-    glass: PaneGlass, maps: Sequence[np.ndarray | None], reach_px: float, rounds: int = 3
-) -> np.ndarray:
-    """The offsets (V, 2) that bring each view's map to where the other views have it on the plane.
-
-    Cross-correlation with the sum of the others, within `reach_px` pixels, on cells a few pixels large.
-    Views without a map stay. Sets nothing: give them to `glass.offsets`.
-    """
-    coarse = copy.copy(glass)
-    factor = max(1.0, math.sqrt(glass.shape[0] * glass.shape[1] / ALIGN_CELLS))
-    coarse.cell = glass.cell * factor
-    coarse.shape = (math.ceil(glass.shape[0] / factor), math.ceil(glass.shape[1] / factor))
-    coarse.offsets = glass.offsets.copy()
-    reach = max(1, math.ceil(reach_px / factor))
-    for _ in range(rounds):
-        spectra = {}
-        for view, values in enumerate(maps):
-            if values is not None:
-                seen = coarse.from_view(view, values)
-                detail = seen - np.nanmean(seen) if np.isfinite(seen).any() else seen
-                spectra[view] = scipy.fft.rfft2(np.nan_to_num(detail), workers=1)
-        if len(spectra) < 3:
-            return glass.offsets.copy()
-        total = np.sum(list(spectra.values()), axis=0)
-        for view, own in spectra.items():
-            match = scipy.fft.irfft2(own * np.conj(total - own), s=coarse.shape, workers=1)
-            coarse.offsets[view] += coarse.cell * _peak(match, reach)
-        chosen = list(spectra)
-        coarse.offsets[chosen] -= coarse.offsets[chosen].mean(axis=0)
-    return coarse.offsets
-
-
-def _peak(match: np.ndarray, reach: int) -> np.ndarray:
-    """The shift (x, y) at the highest value of a circular correlation within `reach`, to a fraction."""
-    span = np.arange(-reach, reach + 1)
-    near = match[np.ix_(span % match.shape[0], span % match.shape[1])]
-    row, column = np.unravel_index(int(near.argmax()), near.shape)
-
-    def vertex(line: np.ndarray, at: int) -> float:
-        if not 0 < at < len(line) - 1:
-            return float(at)
-        before, here, after = (float(v) for v in line[at - 1 : at + 2])
-        bend = before - 2 * here + after
-        return at + 0.5 * (before - after) / bend if bend < 0 else float(at)
-
-    return np.array([vertex(near[row], int(column)), vertex(near[:, column], int(row))]) - reach
 
 
 def neighbours(count: int, middle: int, width: int) -> range:

@@ -8,25 +8,25 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pipeline.masking.align import aligned
 from pipeline.masking.glass import (
     Glass,
     GlassCamera,
     LensGlass,
     PaneGlass,
-    aligned,
     gather,
     neighbours,
 )
 from pipeline.masking.masks import automatic_threshold, dilate, threshold
 from pipeline.masking.remask import Redrawn, redraw
-from pipeline.masking.sweep import Found, find_glass
+from pipeline.masking.sweep import Found, agreement_on, find_glass
 from pipeline.masking.sweep import agreement as agreement_of
 
 log = logging.getLogger(__name__)
 
 # The residual (H, W) of every view, None where it was not fitted, for given drop masks and glass.
 Look = Callable[[Sequence[np.ndarray], Found], Sequence[np.ndarray | None]]
-FEWEST_ON_PANE = 2
+FEWEST_ON_PANE = 1
 SHARE_ON_LENS = 0.25
 MEANS = 0.6  # of the threshold of single maps: a mean seldom reaches their heights
 STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains more than it blurs
@@ -97,14 +97,18 @@ def repair(
     done = [Round(masks, found, changed_share(drop_masks, masks), None)]
     while len(done) <= rounds:
         residuals = look(done[-1].drop_masks, found)
-        found = _look_again(residuals, cameras, farthest, agreement, found, mode)
+        if not (use_attention and isinstance(glass, PaneGlass)):
+            found = _look_again(residuals, cameras, farthest, agreement, found, mode)
+            glass = _glass(found, cameras, residuals)
+        if isinstance(glass, PaneGlass):
+            found = found._replace(pane_agreement=agreement_on(glass, residuals))
         if found.mode == "none":
             return Repaired(done, "what disagrees with the scene does not stay on any glass")
         if use_attention and _agreement(found) < CLEAR:
             return Repaired(done, f"the residual agrees too little {describe(found)}")
         fitted = sum(values is not None for values in residuals)
         redrawn = redraw_views(
-            _glass(found, cameras, attentions if use_attention else residuals),
+            glass,
             residuals,
             done[-1].drop_masks,
             quantile=quantile,
@@ -176,7 +180,7 @@ def _glass(
     """The glass that was found; on a pane the views are brought to cover by their `maps`."""
     if found.mode == "pane" and found.pane_from_world is not None:
         glass = PaneGlass(found.pane_from_world, cameras)
-        glass.offsets = aligned(glass, maps, max(cameras[0].width, cameras[0].height) / OFF)
+        glass.moved = aligned(glass, maps, max(cameras[0].width, cameras[0].height) / OFF)
         return glass
     return LensGlass(cameras[0].height, cameras[0].width)
 

@@ -113,6 +113,17 @@ def find_glass(
     return Found(mode, lens, best, pane_before(cams, *plane), *plane)
 
 
+def agreement_on(glass: PaneGlass, maps: Sequence[np.ndarray | None]) -> float:
+    """How well the views' maps agree on a pane as it stands, the views where `glass.moved` has them."""
+    known = [view for view, values in enumerate(maps) if values is not None]
+    fine, cameras = _prepared(
+        [values for values in maps if values is not None], [glass.cameras[v] for v in known], FINE
+    )
+    own = PaneGlass(glass.pane_from_world, cameras, max_cells=3 * fine[0].size)
+    own.moved = glass.moved[known]
+    return agreement(_stack(own, fine))
+
+
 def _sweep(
     maps: list[np.ndarray],
     cameras: list[GlassCamera],
