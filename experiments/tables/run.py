@@ -34,14 +34,15 @@ def phases(targets: Sequence[str]) -> list[tuple[str, list[str]]]:
             t for kind in kinds for t in targets if t.startswith(f"{kind}@") and t.endswith(end)
         ]
 
-    steps = [("photos, masks, poses", of(("prepare",)))]
-    for number, seed in enumerate(seeds):
-        steps.append((f"fits, seed {seed}", of(("fit", "unaveraged", "loop"), f"-{seed}")))
-        if number == 0:
-            restore = of(("restore",))
-            restore.sort(key=lambda name: name.endswith("-wen"))  # the dearest last
-            steps.append(("removers", restore))
-        steps.append((f"fits to cleaned photos, seed {seed}", of(("cleaned",), f"-{seed}")))
+    restore = of(("restore",))
+    restore.sort(key=lambda name: name.endswith("-wen"))  # the dearest last
+    kinds = ("fit", "unaveraged", "loop")
+    fits = [(f"fits, seed {seed}", of(kinds, f"-{seed}")) for seed in seeds]
+    cleaned = [
+        (f"fits to cleaned photos, seed {seed}", of(("cleaned",), f"-{seed}")) for seed in seeds
+    ]
+    steps = [("photos, masks, poses", of(("prepare",))), *fits[:1], ("removers", restore)]
+    steps += [*cleaned[:1], *fits[1:], *cleaned[1:]]
     return [step for step in steps if step[1]]
 
 
