@@ -92,8 +92,8 @@ def main() -> int:
     start = time.monotonic()
     table = [sys.executable, "-m", "stages.table", "--scene", "all"]
     scenes = sorted({name.split("@")[1] for name in listed.stdout.split() if "prepare@" in name})
-    rendered = [f"../../scenes/dvc.yaml:scene@{scene}" for scene in scenes]
-    subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=folder, check=True)
+    rendered = [f"scene@{scene}" for scene in scenes]
+    subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes", check=True)
     for what, targets in phases(listed.stdout.split()):
         print(f"[{(time.monotonic() - start) / 60:5.1f} min] {what}: {len(targets)}", flush=True)
         _repro(folder, targets)
