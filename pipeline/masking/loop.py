@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 # The residual (H, W) of every view, None where it was not fitted, for given drop masks and glass.
 Look = Callable[[Sequence[np.ndarray], Found], Sequence[np.ndarray | None]]
-FEWEST_ON_PANE = 1
+FEWEST_ON_PANE = 2  # votes, without attention; with it a single view's residual has its say too
 SHARE_ON_LENS = 0.25
 MEANS = 0.6  # of the threshold of single maps: a mean seldom reaches their heights
 STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains more than it blurs
@@ -76,12 +76,13 @@ def repair(
     """Drop masks repaired from a scene that is fitted anew with them, round after round.
 
     `look` fits the scene to what the masks leave and returns the residuals. The glass is found from
-    the `attentions`, and again from the residuals; `mode` lens or pane is taken on trust. With
-    `gather_attention` the loop starts from the attention gathered there (the general form of
-    equation 5). The loop ends early when fewer than the share `settled` of the pixels change, and
-    keeps the masks that it had when the residual shows no glass, when it agrees there less than is
-    needed to add to the attention (a poor field disagrees everywhere), or when the disagreement
-    inside the new masks is not `contrast` times that outside. Other parameters as in `redraw_views`.
+    the `attentions`, and again from the residuals unless the attention showed a pane; `mode` lens or
+    pane is taken on trust. With `gather_attention` the loop starts from the attention gathered there
+    (the general form of equation 5). The loop ends early when fewer than the share `settled` of the
+    pixels change, and keeps the masks that it had when the residual shows no glass, when it agrees
+    there less than is needed to add to the attention (a poor field disagrees everywhere), or when the
+    disagreement inside the new masks is not `contrast` times that outside. Other parameters as in
+    `redraw_views`.
     """
     found = _chosen(find_glass(attentions, cameras, farthest, at_least=agreement), mode)
     masks = list(drop_masks)
@@ -99,7 +100,7 @@ def repair(
         residuals = look(done[-1].drop_masks, found)
         if not (use_attention and isinstance(glass, PaneGlass)):
             found = _look_again(residuals, cameras, farthest, agreement, found, mode)
-            glass = _glass(found, cameras, residuals)
+            glass = _glass(found, cameras, attentions if use_attention else residuals)
         if isinstance(glass, PaneGlass):
             found = found._replace(pane_agreement=agreement_on(glass, residuals))
         if found.mode == "none":
@@ -113,7 +114,7 @@ def repair(
             done[-1].drop_masks,
             quantile=quantile,
             attentions=attentions if use_attention else None,
-            fewest_votes=_fewest(found, min(window or fitted, fitted)),
+            fewest_votes=_fewest(found, min(window or fitted, fitted), use_attention),
             width=window,
             dilation=dilation,
         )
@@ -185,8 +186,10 @@ def _glass(
     return LensGlass(cameras[0].height, cameras[0].width)
 
 
-def _fewest(found: Found, views: int) -> int:
-    return FEWEST_ON_PANE if found.mode == "pane" else max(2, round(SHARE_ON_LENS * views))
+def _fewest(found: Found, views: int, use_attention: bool) -> int:
+    if found.mode == "pane":
+        return 1 if use_attention else FEWEST_ON_PANE
+    return max(2, round(SHARE_ON_LENS * views))
 
 
 class RedrawnViews(NamedTuple):
