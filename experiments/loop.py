@@ -6,6 +6,7 @@
 One line per scene and round: the glass, the share of pixels dropped, precision, recall and IoU against the
 true coverage (> 0.05), and the PSNR of held-out views of the brief fit on the round's masks. `masks` is what
 the detector drew. For a scene without drops every dropped pixel is a false alarm: the share is what counts.
+`--picture FILE` also draws the middle photo of each scene beside its final mask.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from pipeline.evaluation.references import find_references, read_reference
 from pipeline.evaluation.rounds import score_rounds
 from pipeline.evaluation.score import Files
 from pipeline.io.atomic import read_json
+from pipeline.io.images import as_bytes, read_image, write_image
 from pipeline.io.masks import read_keep_mask
 from pipeline.io.paths import ScenePaths
 from pipeline.io.scene import read_images_json
 
 COVERED = 0.05
+FOUND, TOO_MUCH, MISSED = (0.0, 0.8, 0.0), (0.9, 0.0, 0.0), (0.1, 0.1, 1.0)
 
 
 def table(root: Path, scene: str) -> list[str]:
@@ -56,6 +59,23 @@ def table(root: Path, scene: str) -> list[str]:
     return [*lines, f"| {scene} | ended: {about['why']} |"]
 
 
+def picture(root: Path, scene: str) -> np.ndarray:
+    """(H, 2W, 3): the middle photo, and again with what the mask found, marked too much, and missed."""
+    paths = ScenePaths(root, scene)
+    records = read_images_json(paths.images)
+    record = records[len(records) // 2]
+    photo = read_image(paths.images / record.name)
+    drop_mask = ~read_keep_mask(paths.refine / record.name, record.size)
+    covers = find_references(paths.truth / "coverage", [record]) or {}
+    true = read_reference(covers[record.name], record, paths.data / record.source)[..., 0] > COVERED
+    marked = photo.copy()
+    for where, colour in (
+        (drop_mask & true, FOUND), (drop_mask & ~true, TOO_MUCH), (~drop_mask & true, MISSED),
+    ):  # fmt: skip
+        marked[where] = 0.45 * marked[where] + 0.55 * np.float32(colour)
+    return np.concatenate([photo, marked], axis=1)
+
+
 def _line(scene: str, what: str, numbers: dict[str, float], glass: str) -> str:
     names = ("coverage", "precision", "recall", "iou")
     cells = [f"{numbers[name]:.3f}" if name in numbers else "–" for name in names]
@@ -68,6 +88,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument("--run", action="store_true", help="run stages.refine of each scene first")
+    parser.add_argument("--picture", type=Path, help="of scenes of one size, one below the other")
     flags = parser.parse_args()
     print(
         "| scene | round | dropped | precision | recall | IoU | PSNR | glass |\n" + "|---" * 8 + "|"
@@ -77,6 +98,10 @@ def main() -> None:
             command = [sys.executable, "-m", "stages.refine", "--scene", scene]
             subprocess.run([*command, "--params", str(flags.params)], check=True)
         print("\n".join(table(flags.params.resolve().parent, scene)), flush=True)
+    if flags.picture:
+        root = flags.params.resolve().parent
+        rows = [as_bytes(picture(root, scene)) for scene in flags.scenes]
+        write_image(flags.picture, np.concatenate(rows))
 
 
 if __name__ == "__main__":
