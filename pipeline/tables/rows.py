@@ -17,7 +17,7 @@ class Row:
     paper: str = ""
     seeded: bool = True
     competes: bool = True
-    kind: Literal["test", "composite"] = "test"
+    kind: Literal["test", "composite", "input"] = "test"
     split: Literal["test", "train"] = "test"
     name: str = ""
 
@@ -28,6 +28,10 @@ class Row:
 
 
 ROWS = (
+    Row(
+        "loop-0", "The wet photos themselves", seeded=False, competes=False, kind="input",
+        name="photo",
+    ),
     Row("nerf", "NeRF", "NeRF"),
     Row("attgan", "AttGAN", "AttGAN", seeded=False),
     Row("quan", "Quan et al.", "Quan et al.", seeded=False),

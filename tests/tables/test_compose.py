@@ -23,7 +23,7 @@ def test_limits_and_other_views_are_never_the_best() -> None:
     table = compose.comparison(SCORES, ["street"], {}, ["A note."])
     assert best(table, table.columns[0]) == ("loop", False)  # 1 ahead of derain, spreads 1 + 1
     assert {line.key for line in table.lines if not line.competes} == {
-        "true", "clean", "composite", "composite-inputs",
+        "photo", "true", "clean", "composite", "composite-inputs",
     }  # fmt: skip
 
 
