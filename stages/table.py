@@ -89,7 +89,7 @@ def main(job: Job, params: Params) -> str:
 def _why(row: Row, scene: str, params: Params) -> str:
     if row.key == "unaveraged" and scene not in params.lens:
         return "equation 5 is for drops on the lens; without it the masks are those of the next row"
-    return "not computed"
+    return "not computed, or not for every seed"
 
 
 def _lpips(scores: Found, net: str) -> str:

@@ -90,7 +90,8 @@ def gains(scores: Scores, scenes: Sequence[str], missing: Missing) -> Table:
             if ours and theirs in PAPER and theirs != ours:
                 gain = PAPER[ours][i][0] - PAPER[theirs][i][0]
                 cells[label, f"paper {scene}"] = (gain,)
-            gaps[label, f"paper {scene}"] = "the paper has no such figures by scene"
+            else:
+                gaps[label, f"paper {scene}"] = "the paper has no such figures by scene"
     lines = tuple(Line(label, label, False) for _, _, label in GAINS)
     columns = tuple(Column(f"here {s}", "here", s, 2, None) for s in scenes)
     columns += tuple(Column(f"paper {s}", "paper", s, 2, None) for s in PAPER_SCENES)

@@ -41,7 +41,8 @@ class Column:
 @dataclass(frozen=True)
 class Table:
     """A table by name and title. `cells`: the values of the seeds by (line, column); `missing`: why there
-    are none, by the same keys; `marked`: cells beyond the spread in their own right; `notes`: sentences.
+    are none, or not all, by the same keys; `marked`: cells beyond the spread in their own right;
+    `notes`: sentences.
     """
 
     name: str
@@ -80,12 +81,13 @@ def best(table: Table, column: Column) -> tuple[str, bool] | None:
 
 
 def gaps(table: Table) -> list[tuple[str, list[str]]]:
-    """Why cells are empty, each reason with the cells that it explains, as "line, group"."""
+    """Why cells are empty, or lack some of their values, each reason with its cells, as "line, group"."""
     told: dict[str, list[str]] = {}
     for line in table.lines:
         for column in table.columns:
-            if not table.values(line, column):
-                why = table.missing.get((line.key, column.key), "not computed")
+            key = (line.key, column.key)
+            if not table.values(line, column) or key in table.missing:
+                why = table.missing.get(key, "not computed")
                 place = f"{line.label}, {column.group}" if column.group else line.label
                 if place not in told.setdefault(why, []):
                     told[why].append(place)

@@ -50,6 +50,10 @@ def test_the_best_is_bold_and_starred_only_beyond_the_spread() -> None:
 def test_what_is_missing_is_said_with_its_reason() -> None:
     assert gaps(TABLE) == [("no FLIP here", ["D, street"])]
     assert "– D, street: no FLIP here." in markdown(TABLE)
+    some = Table(
+        "t", "t", TABLE.lines[:1], (PSNR,), {("a", "psnr"): (1.0,)}, {("a", "psnr"): "one seed"}
+    )
+    assert gaps(some) == [("one seed", ["A & B, street"])]
     unsaid = Table("t", "t", TABLE.lines[:1], (PSNR,), {})
     assert gaps(unsaid) == [("not computed", ["A & B, street"])]
 
