@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from pipeline.attention import pools
 from pipeline.attention.samples import Pool
-from pipeline.attention.training import Phase, Score, Trainer, curve_rows, curve_text, fit
+from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit
 from pipeline.attention.weights import DETECTORS, load_network, save_network
-from pipeline.io.atomic import write_bytes, write_text
+from pipeline.io.atomic import write_bytes, write_csv
 from pipeline.io.paths import ScenePaths
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
@@ -85,7 +85,7 @@ def main(job: Job, params: Params) -> str:
                       on_score=on_score)  # fmt: skip
     target = job.resolve(params.weights)
     save_network(target, average)
-    write_text(target.with_suffix(".csv"), curve_text(rows))
+    write_csv(target.with_suffix(".csv"), CURVE, rows)
     return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"
 
 

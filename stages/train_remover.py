@@ -13,13 +13,13 @@ from tqdm import tqdm
 from pipeline.attention import pools
 from pipeline.attention.training import attention_loss
 from pipeline.attention.weights import load_network
-from pipeline.io.atomic import write_text
+from pipeline.io.atomic import write_csv
 from pipeline.parallel import map_named
 from pipeline.removal import clips, store
 from pipeline.removal.losses import PerceptualLoss
 from pipeline.removal.recipes import recipe_of
 from pipeline.removal.samples import Pairs
-from pipeline.removal.training import Plan, Trainer, curve_rows, curve_text, fit
+from pipeline.removal.training import CURVE, Plan, Trainer, curve_rows, fit
 from pipeline.stage import Job, Section, run
 
 Count = Annotated[int, Field(ge=1)]
@@ -78,7 +78,7 @@ def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
         average = fit(trainer, params.validate_every, {name: Pairs(*unseen)}, on_score)
     target = job.resolve(params.folder) / f"{method}.safetensors"
     store.save_remover(target, average, method)
-    write_text(target.with_suffix(".csv"), curve_text(rows))
+    write_csv(target.with_suffix(".csv"), CURVE, rows)
     before, after = rows[-1][3:]
     return f"{target.name}: {before} -> {after} dB on pictures that it was not trained on"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -15,8 +14,8 @@ from pipeline.attention.samples import Pool, coverage_of_pair
 from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import sample_shots
 from pipeline.errors import UserError
-from pipeline.io.atomic import write_bytes
-from pipeline.io.images import PHOTO_SUFFIXES, read_photo, shrink
+from pipeline.io.atomic import write_npy
+from pipeline.io.images import PHOTO_SUFFIXES, as_bytes, read_photo, shrink
 
 CHUNK = 100
 SIZE = 256
@@ -40,10 +39,8 @@ def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()
         rng = np.random.default_rng([seed, chunk, k])
         shots = sample_shots(rng, background(rng, photos))
         stacked = np.dstack(shots)
-        pictures[k] = np.rint(np.clip(stacked, 0, 1) * 255).astype(np.uint8)
-    buffer = io.BytesIO()
-    np.save(buffer, pictures)
-    write_bytes(path, buffer.getvalue())
+        pictures[k] = as_bytes(stacked)
+    write_npy(path, pictures)
 
 
 def painted_name(seed: int, photos: Sequence[Path]) -> str:

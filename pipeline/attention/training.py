@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import csv
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -249,13 +247,6 @@ def curve_rows(
         figures = (each.threshold, each.precision, each.recall, each.f1, each.iou)
         rows.append([done, steps, round(loss, 6), name, *(round(f, 4) for f in figures)])
     return rows
-
-
-def curve_text(rows: Sequence[Sequence[float | str]]) -> str:
-    """The validation curve as CSV, with its heading."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([CURVE, *rows])
-    return text.getvalue()
 
 
 def fit(

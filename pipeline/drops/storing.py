@@ -14,7 +14,7 @@ from pipeline.drops import mitsuba_scene, places, synthesis
 from pipeline.drops.creep import crept
 from pipeline.drops.shape import Drop
 from pipeline.io.atomic import write_bytes
-from pipeline.io.images import read_photo
+from pipeline.io.images import as_bytes, read_photo
 from pipeline.io.maps import write_depth, write_map
 
 Recipe = dict[str, Any]  # the section `synthesize`, as plain values
@@ -77,7 +77,7 @@ def store(
 ) -> None:
     """Writes a photo with its clean reference and coverage; the photo comes last."""
     encode(work / f"truth/clean/{stem}.jpg", clean, 98)
-    encode(work / f"truth/coverage/{stem}.png", synthesis.to_bytes(alpha))
+    encode(work / f"truth/coverage/{stem}.png", as_bytes(alpha))
     if recipe["maps"]:
         (work / "truth/alpha").mkdir(parents=True, exist_ok=True)
         write_map(work / f"truth/alpha/{stem}.exr", alpha)

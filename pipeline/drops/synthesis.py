@@ -25,6 +25,7 @@ from pipeline.drops.pane import (
 from pipeline.drops.shape import Drop, sample_drops
 from pipeline.drops.stains import over, sample_stains, seen_layer, stained
 from pipeline.geometry.cameras import intrinsic_matrix
+from pipeline.io.images import as_bytes
 
 Bytes = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
@@ -176,11 +177,6 @@ def place_exposure(baked: scene.Baked, camera: scene.Camera) -> float:
     return scene.exposure(quick.radiance, grey=baked.place.grey)
 
 
-def to_bytes(picture: npt.NDArray[np.floating]) -> Bytes:
-    """[0, 1] to 8 bits, rounded."""
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
-
-
 def wet_view(
     baked: scene.Baked,
     camera: scene.Camera,
@@ -217,9 +213,9 @@ def wet_view(
     # Other random numbers than the rainy picture's, so that their noise is not the same.
     clean = scene.render(baked, camera, cam_from_world, spp=clean_spp, seed=2 * seed + 1)
     return WetView(
-        to_bytes(scene.develop(radiance, exposure)),
-        to_bytes(scene.develop(clean.radiance, exposure)),
-        to_bytes(alpha),
+        as_bytes(scene.develop(radiance, exposure)),
+        as_bytes(scene.develop(clean.radiance, exposure)),
+        as_bytes(alpha),
         clean.depth,
         alpha,
     )
@@ -277,11 +273,11 @@ def _with_stains(
 ) -> tuple[Bytes, npt.NDArray[np.float32]]:
     """The painted photo and its coverage with what else is on the pane."""
     if spots is None:
-        return to_bytes(rainy), alpha
+        return as_bytes(rainy), alpha
     size = (alpha.shape[1], alpha.shape[0])
     layer = stains_seen(spots, k, size, cam_from_pane, aperture_m, FOCUS_M)
     rainy = linear_to_srgb(stained(srgb_to_linear(rainy), layer))
-    return to_bytes(rainy), 1 - (1 - alpha) * (1 - layer[..., 3])
+    return as_bytes(rainy), 1 - (1 - alpha) * (1 - layer[..., 3])
 
 
 def pane_plan(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import io
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,13 @@ def write_npy(path: Path, values: np.ndarray) -> None:
     file = io.BytesIO()
     np.save(file, values, allow_pickle=False)
     write_bytes(path, file.getvalue())
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[float | str]]) -> None:
+    """Writes rows under the names of their columns."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    write_text(path, text.getvalue())
 
 
 def write_json(path: Path, content: Any) -> None:

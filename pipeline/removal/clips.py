@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import io
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -14,8 +13,8 @@ import numpy as np
 
 from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import sample_shots
-from pipeline.io.atomic import write_bytes
-from pipeline.io.images import read_photo, shrink
+from pipeline.io.atomic import write_npy
+from pipeline.io.images import as_bytes, read_photo, shrink
 from pipeline.removal.wen import FRAMES
 
 CHUNK = 20
@@ -83,10 +82,8 @@ def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()
         rng = np.random.default_rng([seed, chunk, k, 5])
         rainy, clean, coverage = paint_clip(rng, _still(rng, photos), SIZE)
         stacked = np.concatenate([rainy, clean, np.dstack([coverage] * 3)[None]])
-        clips[k] = np.rint(np.clip(stacked, 0, 1) * 255).astype(np.uint8)
-    buffer = io.BytesIO()
-    np.save(buffer, clips)
-    write_bytes(path, buffer.getvalue())
+        clips[k] = as_bytes(stacked)
+    write_npy(path, clips)
 
 
 def read_chunk(path: Path) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import csv
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -254,13 +252,6 @@ def curve_rows(
         [done, round(loss, 6), name, round(before, 3), round(after, 3)]
         for name, (before, after) in found.items()
     ]
-
-
-def curve_text(rows: Sequence[Sequence[float | str]]) -> str:
-    """The validation curve as CSV, with its heading."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([CURVE, *rows])
-    return text.getvalue()
 
 
 def fit(

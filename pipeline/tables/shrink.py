@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from pipeline.io.given import of_view
 from pipeline.io.scene import ImageRecord
 from pipeline.io.transforms import View
 
@@ -43,8 +44,4 @@ def smaller_view(view: View, size: tuple[int, int]) -> View:
 
     Pixel (0, 0)'s centre is (0.5, 0.5), so intrinsics scale with the picture and nothing is added.
     """
-    x, y = size[0] / view.width, size[1] / view.height
-    return replace(
-        view, fx=view.fx * x, fy=view.fy * y, cx=view.cx * x, cy=view.cy * y,
-        width=size[0], height=size[1],
-    )  # fmt: skip
+    return of_view(view).view(view.name, size)

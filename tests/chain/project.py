@@ -18,8 +18,9 @@ import numpy as np
 import yaml
 from ruamel.yaml import YAML
 
-from pipeline.drops.synthesis import painted, to_bytes
+from pipeline.drops.synthesis import painted
 from pipeline.io.atomic import write_json
+from pipeline.io.images import as_bytes
 from tests import planes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,7 +79,7 @@ def photograph(folder: Path) -> None:
         angle, radius = 2.4 * index, 0.9 * np.sqrt((index + 0.5) / VIEWS)
         place = (radius * np.cos(angle), 0.4 * radius * np.sin(angle), 0.2 * np.sin(3 * angle))
         cam = planes.camera_at(*place)
-        clean = to_bytes(planes.draw(cam, cover=planes.masonry))
+        clean = as_bytes(planes.draw(cam, cover=planes.masonry))
         rainy, coverage = painted(
             clean, seed=3, pane_m=0.12, coverage=0.11, radius_mm=(2.5, 6.0), aperture_mm=1.0,
             field_of_view_deg=FIELD_OF_VIEW, focal=planes.FOCAL,
@@ -87,7 +88,7 @@ def photograph(folder: Path) -> None:
         cams[name] = {"cam_from_world": cam.tolist()}
         _save(folder / f"{name}.png", rainy)
         _save(folder / f"truth/clean/{name}.png", clean)
-        _save(folder / f"truth/coverage/{name}.png", to_bytes(coverage))
+        _save(folder / f"truth/coverage/{name}.png", as_bytes(coverage))
     write_json(folder / "truth/cameras.json", {"frames": cams, "unit": "m"})
 
 
