@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -57,7 +58,8 @@ def _call(label: str, name: str, function: Callable[..., Any], args: tuple[Any, 
     try:
         return function(*args)
     except UserError as error:
-        if name in error.what:
+        # A photo is IMG_1.png inside and IMG_1.jpg where it came from.
+        if name in error.what or f"{Path(name).stem}." in error.what:
             raise
         raise UserError(f"{name}: {error.what}", error.hint) from error
     except Exception as error:

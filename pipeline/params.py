@@ -43,7 +43,7 @@ def read_section(
     try:
         return section_type.model_validate(merged)
     except pydantic.ValidationError as error:
-        problems = [_sentence(name, problem, section_type) for problem in error.errors()]
+        problems = _sentences(name, error.errors(), merged, section_type)
         raise UserError(f"{file.name}: " + "; ".join(problems) + ".", CORRECT) from None
 
 
@@ -184,12 +184,41 @@ def _nearest(name: str, choices: Iterable[str]) -> str:
     return f" Did you mean {close[0]}?" if close else ""
 
 
-def _sentence(section: str, problem: Any, section_type: type[Section]) -> str:
-    keys = ".".join(str(part) for part in problem["loc"])
-    where = f"{section}.{keys}" if keys else section
-    if problem["type"] == "extra_forbidden":
-        return f"{where} is unknown.{_nearest(keys, section_type.model_fields)}".rstrip(".")
-    if problem["type"] == "missing":
+def _sentences(
+    section: str, problems: Iterable[Any], values: Mapping[str, Any], section_type: type[Section]
+) -> list[str]:
+    """One sentence for every key that has problems, without its full stop."""
+    by_key: dict[str, list[Any]] = {}
+    for problem in problems:
+        by_key.setdefault(_key(problem["loc"], values), []).append(problem)
+    return [
+        _sentence(f"{section}.{key}" if key else section, key, of_key, section_type)
+        for key, of_key in by_key.items()
+    ]
+
+
+def _key(place: Iterable[int | str], values: Any) -> str:
+    """The key as it stands in the file: a value of several allowed kinds is told once per kind."""
+    parts = []
+    for part in place:
+        if not isinstance(values, Mapping | list):
+            break
+        parts.append(str(part))
+        try:
+            values = values[part]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            break
+    return ".".join(parts)
+
+
+def _sentence(where: str, key: str, problems: list[Any], section_type: type[Section]) -> str:
+    kinds = {problem["type"] for problem in problems}
+    if "extra_forbidden" in kinds:
+        near = _nearest(key, section_type.model_fields).strip().rstrip("?")
+        return f"{where} is unknown" + (f" ({near[0].lower()}{near[1:]}?)" if near else "")
+    if "missing" in kinds:
         return f"{where} is missing"
-    message = problem["msg"].removeprefix("Value error, ")
-    return f"{where}: {message[0].lower()}{message[1:]} (got {problem['input']!r})"
+    wishes = [problem["msg"].removeprefix("Value error, ") for problem in problems]
+    first, *others = [f"{wish[0].lower()}{wish[1:]}" for wish in wishes]
+    either = "".join(f" or {wish.removeprefix('input should be ')}" for wish in others)
+    return f"{where}: {first}{either} (got {problems[0]['input']!r})"

@@ -97,7 +97,7 @@ def run(
     if stage is not None:
         params_type, main = stage.Params, stage.main
     try:
-        parser = _parser(name)
+        parser = _parser(name, sys.modules["__main__"].__doc__ or "")
         if add_flags is not None:
             add_flags(parser)
         flags = parser.parse_args(sys.argv[1:])
@@ -175,22 +175,29 @@ def _logged(name: str, stage: Callable[[], str | None], work: Path) -> str | Non
         raise fault from error
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
+def _parser(name: str, about: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m stages.{name}",
-        description=f"Runs the stage `{name}` of one scene. Its parameters are the section `{name}` of "
-        "params.yaml, with the scene's own values under scenes.<scene>.",
+        description=about,
+        epilog=f"Parameters are the section `{name}` of params.yaml, with the scene's own values under "
+        f"scenes.<scene>.{name}. Exit codes: 0 done, 2 a fault that you can mend, 1 a defect.",
     )
     parser.add_argument("--scene", required=True, help="a scene named in params.yaml")
     parser.add_argument("--variant", help="a variant named in params.yaml, e.g. unmasked")
     parser.add_argument(
         "--params", type=Path, help="params.yaml (default: the one here, else the checkout's)"
     )
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="where torch computes; auto (the default): on a GPU if there is one",
+    )
     parser.add_argument(
         "--scheduler",
         default=os.environ.get("DERAINNERF_SCHEDULER") or None,
-        help="address of a running Dask cluster, tcp://host:port (default: threads on this machine)",
+        help="address of a running Dask cluster, tcp://host:port (default: $DERAINNERF_SCHEDULER, else "
+        "threads on this machine)",
     )
     parser.add_argument("--verbose", action="store_true", help="log details to the terminal too")
     return parser

@@ -9,17 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from pipeline.io import intake
 from pipeline.io.atomic import publish_dir, write_text
 from pipeline.io.capture import Capture, adopt, find_capture
 from pipeline.io.frames import save_frames
-from pipeline.io.intake import (
-    given_turns,
-    given_views,
-    masks_said,
-    photo_records,
-    straighteners,
-    write_given_masks,
-)  # fmt: skip
 from pipeline.io.paths import ScenePaths
 from pipeline.io.photos import convert, examine, final_size, plan_sizes
 from pipeline.io.scene import (
@@ -57,7 +50,8 @@ def main(job: Job, params: Params) -> str:
     capture = find_capture(job.paths.data, params.min_images, read_colmap)
     with publish_dir(job.paths.images) as fresh:
         if capture.video is not None:
-            records = save_frames(capture.video, fresh, params.frames, params.max_size)
+            fewest, longest = params.min_images, params.max_size
+            records = save_frames(capture.video, fresh, params.frames, longest, at_least=fewest)
             origin = Origin(kind="video")
         else:
             records, origin = _from_photos(job, capture, fresh, params)
@@ -76,10 +70,10 @@ def _from_photos(
         examine, {name: (path,) for name, path in capture.photos.items()},
         job_label="reading photos", scheduler=job.scheduler,
     )  # fmt: skip
-    turns = given_turns(photos, capture.views)
+    turns = intake.given_turns(photos, capture.views)
     plan = plan_sizes(photos, mixed=params.mixed_sizes, fixed_turns=turns)
     size = final_size(plan.size, params.max_size)
-    straighten = straighteners(capture.views)
+    straighten = intake.straighteners(capture.views)
     map_named(
         convert,
         {
@@ -88,11 +82,11 @@ def _from_photos(
         },
         job_label="writing images", scheduler=job.scheduler,
     )  # fmt: skip
-    records = photo_records(capture, photos, plan, size, job.paths.data)
+    records = intake.photo_records(capture, photos, plan, size, job.paths.data)
     if capture.views:
-        write_transforms(folder / GIVEN_POSES, given_views(capture, plan, size, straighten))
-    share = write_given_masks(folder / GIVEN_MASKS, capture, photos, plan, size, straighten)
-    said = plan.said + (masks_said(capture.masked_by, share) if share is not None else [])
+        write_transforms(folder / GIVEN_POSES, intake.given_views(capture, plan, size, straighten))
+    share = intake.write_given_masks(folder / GIVEN_MASKS, capture, photos, plan, size, straighten)
+    said = plan.said + (intake.masks_said(capture.masked_by, share) if share is not None else [])
     return records, Origin("photos", capture.posed_by, capture.masked_by, plan.left_out, said)
 
 

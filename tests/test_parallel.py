@@ -60,6 +60,13 @@ def test_a_users_fault_stays_one_and_names_its_item(tmp_path: Path) -> None:
         map_named(examine, {"a.png": (tmp_path / "a.jpg",)}, job_label="test")
 
 
+def test_an_image_is_not_named_twice_by_the_names_inside_and_outside(tmp_path: Path) -> None:
+    (tmp_path / "IMG_2.jpg").write_text("no photo")
+    with pytest.raises(UserError) as caught:
+        map_named(examine, {"IMG_2.png": (tmp_path / "IMG_2.jpg",)}, job_label="test")
+    assert caught.value.what.startswith(f"{tmp_path / 'IMG_2.jpg'} is not an image")
+
+
 def test_a_cluster_of_two_processes_writes_the_same_bytes(tmp_path: Path, cluster: str) -> None:
     rng = np.random.default_rng(0)
     for number in range(5):

@@ -60,7 +60,7 @@ def test_every_problem_is_told_at_once_with_the_nearest_name(tmp_path: Path) -> 
     sentence = str(caught.value)
     assert "masks.threshold" in sentence
     assert "1.5" in sentence
-    assert "masks.dilatoin is unknown. Did you mean dilation?" in sentence
+    assert "masks.dilatoin is unknown (did you mean dilation?)" in sentence
     assert "masks.dilation is missing" in sentence
 
 
@@ -105,6 +105,32 @@ def test_the_shipped_file_is_valid_and_complete() -> None:
         assert not optional, (
             f"{stage}: params.yaml must hold {optional}, so the model gives no defaults"
         )
+
+
+class Either(Section):
+    threshold: Annotated[float, Field(ge=0, le=1)] | Literal["auto"]
+    phases: list[Masks]
+
+
+@pytest.mark.parametrize(
+    ("section", "told"),
+    [
+        ("threshold: 1.5, phases: []", "less than or equal to 1 or 'auto' (got 1.5)."),
+        ("threshold: high, phases: []", "as a number or 'auto' (got 'high')."),
+        (
+            "threshold: auto, phases: [{threshold: 0, temporal_mean: on, dilation: -1}]",
+            "params.yaml: masks.phases.0.dilation: input should be greater than or equal to 0 (got -1).",
+        ),
+    ],
+)
+def test_a_value_of_several_kinds_is_told_as_one_problem_in_the_files_terms(
+    tmp_path: Path, section: str, told: str
+) -> None:
+    text = f"scenes: {{demo: {{}}}}\nmasks: {{{section}}}\n"
+    with pytest.raises(UserError) as caught:
+        read_section(_file(tmp_path, text), "masks", Either, "demo")
+    assert caught.value.what.endswith(told)
+    assert caught.value.what.count("masks.") == 1
 
 
 def test_a_scene_is_added_and_nothing_else_changes(tmp_path: Path) -> None:

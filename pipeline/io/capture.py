@@ -152,11 +152,13 @@ def _masks(folder: Path, photos: dict[str, Path], views: Iterable[GivenView]) ->
             if (folder / MASKS / candidate).is_file():
                 found[name] = folder / MASKS / candidate
                 break
-    missing = sorted(photos.keys() - found.keys())
-    if found and missing:
+    missing = [photo.name for name, photo in sorted(photos.items()) if name not in found]
+    pictures = any(path.suffix.lower() in PHOTO_SUFFIXES for path in (folder / MASKS).iterdir())
+    if missing and pictures:
         shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if missing[3:] else "")
         raise UserError(
-            f"{folder / MASKS} has no mask for {shown}.", "Give every photo a mask, or none."
+            f"{folder / MASKS} has no mask for {shown}.",
+            "Give every photo a mask, named IMG_1.jpg.png, IMG_1.jpg or IMG_1.png for IMG_1.jpg, or none.",
         )
     return found
 
@@ -170,7 +172,8 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
     source = Path(os.path.normpath(source))
     if data.exists():
         raise UserError(
-            f"{data} exists already.", "Choose another --scene, or leave --from away to use it."
+            f"{data} exists already.",
+            "Leave --from away to use it, remove it to bring the photos in anew, or choose another --scene.",
         )
     if source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
         with publish_dir(data) as fresh:

@@ -87,12 +87,20 @@ def read_frames(path: Path, chosen: list[Frame]) -> Iterator[tuple[Frame, np.nda
             return
 
 
-def save_frames(path: Path, folder: Path, count: int, longest_side: int) -> list[ImageRecord]:
+def save_frames(
+    path: Path, folder: Path, count: int, longest_side: int, *, at_least: int = 1
+) -> list[ImageRecord]:
     """Writes at most `count` frames of the video into `folder`, no side above `longest_side` (0: any).
 
     Returns their records: `source` tells the video and the time, the checksum is the video's.
+    UserError when there are fewer than `at_least`.
     """
     chosen, digest = pick_frames(path, count), file_sha256(path)
+    if len(chosen) < at_least:
+        raise UserError(
+            f"{path} shows only {len(chosen)} different places; a scene needs at least {at_least}.",
+            "Film for longer, walking; 20 to 60 seconds are plenty.",
+        )
     records: list[ImageRecord] = []
     for frame, pixels in read_frames(path, chosen):
         size = final_size((pixels.shape[1], pixels.shape[0]), longest_side)

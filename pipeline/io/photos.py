@@ -81,9 +81,18 @@ def list_photos(folder: Path, at_least: int) -> dict[str, Path]:
         found = {0: "no photos", 1: "one photo only"}.get(len(photos), f"{len(photos)} photos only")
         raise UserError(
             f"{folder} holds {found}; a scene needs at least {at_least}.",
-            "Twenty or more, taken from different places, work best (JPEG, PNG, TIFF or WebP).",
+            _below(folder)
+            or "Twenty or more, taken from different places, work best (JPEG, PNG, TIFF or WebP).",
         )
     return photos
+
+
+def _below(folder: Path) -> str:
+    """Where else the photos may be meant to be, as a hint: only the top level is searched."""
+    for below in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if any(path.suffix.lower() in PHOTO_SUFFIXES for path in below.iterdir()):
+            return f"Subfolders are not searched: move the photos up, or name {below} with --from."
+    return ""
 
 
 def by_image_name(paths: Iterable[Path]) -> dict[str, Path]:
@@ -214,7 +223,7 @@ def _scaled_together(photos: Mapping[str, Photo], turns: Mapping[str, int]) -> P
     if left_out:
         said.append(
             f"{len(left_out)} of {len(photos)} photos have another shape than the rest and are left "
-            f"out: {', '.join(left_out)}"
+            f"out: {', '.join(Path(name).stem for name in left_out)}"
         )
     return Plan(kept, smallest, left_out, said)
 

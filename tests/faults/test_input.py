@@ -117,7 +117,7 @@ def test_what_lies_about_in_folders_of_photos_is_no_fault(photos: Workshop) -> N
 
 def test_an_unknown_parameter_names_the_nearest(photos: Workshop) -> None:
     photos.set("ingest", max_sise=3)
-    photos.refuses("ingest", "ingest.max_sise is unknown. Did you mean max_size?")
+    photos.refuses("ingest", "ingest.max_sise is unknown (did you mean max_size?)")
 
 
 @pytest.mark.parametrize(

@@ -231,8 +231,15 @@ def test_masks_are_found_by_any_usual_name_and_for_all_or_none(tmp_path: Path) -
         "c.png": "c.png",
     }
     (tmp_path / "masks/b.jpg").unlink()
-    with pytest.raises(UserError, match=r"no mask for b\.png"):
+    with pytest.raises(UserError, match=r"no mask for b\.jpg"):
         _find(tmp_path)
+    for path in (tmp_path / "masks").iterdir():
+        path.rename(path.with_name(f"mask of {path.name}"))
+    with pytest.raises(UserError, match=r"no mask for a\.jpg, b\.jpg, c\.jpg"):
+        _find(tmp_path)  # not passed over in silence
+    for path in (tmp_path / "masks").iterdir():
+        path.unlink()
+    assert not _find(tmp_path).masks, "an empty folder holds none, for nobody"
 
 
 def test_a_video_stands_alone(tmp_path: Path) -> None:

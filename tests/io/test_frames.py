@@ -73,6 +73,13 @@ def test_saved_frames_are_numbered_and_tell_their_time(video: Path, tmp_path: Pa
     assert records[0].source.startswith("pan.mp4 at ")
 
 
+def test_a_video_of_too_few_places_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    write_video(tmp_path / "short.mp4", _pan()[1][20:22], 24)
+    with pytest.raises(UserError, match=r"short\.mp4 shows only \d different places.*at least 9"):
+        save_frames(tmp_path / "short.mp4", tmp_path / "out", 40, 0, at_least=9)
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_is_no_video_and_what_does_not_move_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("not a video")
     with pytest.raises(UserError, match=r"text\.mp4 is not a video"):

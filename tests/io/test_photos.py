@@ -85,7 +85,7 @@ def test_photos_of_one_shape_are_scaled_to_the_smallest_and_it_is_said(tmp_path:
     plan = plan_sizes(photos)
     assert (plan.size, plan.left_out) == ((40, 30), ["3.png"])
     assert "2 of 80x60, 1 of 40x30" in plan.said[0]
-    assert "3.png" in plan.said[1], "57/43 = 1.326 is not 4/3"
+    assert plan.said[1].endswith("left out: 3"), "57/43 = 1.326 is not 4/3"
     with pytest.raises(UserError, match=r"mixed sizes: 2 of 80x60, 1 of 40x30, 1 of 57x43"):
         plan_sizes(photos, mixed="refuse")
 
@@ -170,6 +170,15 @@ def test_the_folder_is_listed_by_the_names_images_will_have(tmp_path: Path) -> N
         list_photos(tmp_path, 4)
     _photo(tmp_path / "a.png")
     with pytest.raises(UserError, match=r"both become a\.png"):
+        list_photos(tmp_path, 1)
+
+
+def test_photos_in_a_subfolder_are_pointed_at(tmp_path: Path) -> None:
+    (tmp_path / "roll" / "one").mkdir(parents=True)
+    with pytest.raises(UserError, match="Twenty or more"):
+        list_photos(tmp_path, 1)
+    _photo(tmp_path / "roll" / "a.jpg")
+    with pytest.raises(UserError, match=r"holds no photos.*name .*roll with --from"):
         list_photos(tmp_path, 1)
 
 
