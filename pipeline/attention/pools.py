@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from pipeline.attention.samples import Pool, coverage_of_pair
+from pipeline.drops import stills
 from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import sample_shots
 from pipeline.errors import UserError
 from pipeline.io.atomic import write_npy
-from pipeline.io.images import PHOTO_SUFFIXES, as_bytes, read_photo, shrink
+from pipeline.io.images import PHOTO_SUFFIXES, as_bytes, read_photo
 
 CHUNK = 100
 SIZE = 256
 PHOTO_SHARE = 0.7
-LONGEST = 1200
 KINDS = ("rainy", "clean", "coverage")
 # Rainy (H,W,3), clean (H,W,3) and coverage (H,W), all uint8, in the same order.
 Pictures = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]
@@ -45,17 +43,14 @@ def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()
 
 def painted_name(seed: int, photos: Sequence[Path]) -> str:
     """A name for pictures painted from this seed and these photos, whatever folder they lie in."""
-    digest = hashlib.sha256(str(seed).encode())
-    for photo in photos:
-        digest.update(photo.read_bytes())
-    return f"painted-{digest.hexdigest()[:12]}"
+    return stills.painted_name("painted", seed, photos)
 
 
 def background(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:
     """A clean picture (256,256,3) in [0,1]: a crop of a photo at any scale, or a procedural one."""
     if not photos or rng.random() >= PHOTO_SHARE:
         return sample_background(rng, SIZE)
-    photo = _photo(photos[int(rng.integers(len(photos)))])
+    photo = stills.still(photos[int(rng.integers(len(photos)))])
     shortest = min(photo.shape[:2])
     # From detail at full size to a whole photo made small, as if seen from further away.
     side = round(float(np.exp(rng.uniform(np.log(min(0.6 * SIZE, shortest)), np.log(shortest)))))
@@ -67,11 +62,6 @@ def background(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:
         crop = crop[:, ::-1]
     crop = crop * np.exp(rng.normal(0, 0.2)) * rng.uniform(0.92, 1.08, 3)
     return np.clip(crop, 0, 1).astype(np.float32)
-
-
-@lru_cache(maxsize=256)
-def _photo(path: Path) -> np.ndarray:
-    return shrink(read_photo(path)[0], LONGEST)
 
 
 def read_chunk(path: Path) -> Pictures:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from pipeline.drops import stills
 from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import sample_shots
 from pipeline.io.atomic import write_npy
-from pipeline.io.images import as_bytes, read_photo, shrink
+from pipeline.io.images import as_bytes
 from pipeline.removal.wen import FRAMES
 
 CHUNK = 20
 SIZE = 160
 PHOTO_SHARE = 0.8
-LONGEST = 1200
 
 
 def pan(rng: np.random.Generator, still: np.ndarray, size: int) -> np.ndarray:
@@ -98,18 +96,10 @@ def read_chunk(path: Path) -> tuple[list[np.ndarray], list[np.ndarray], list[np.
 
 def painted_name(seed: int, photos: Sequence[Path]) -> str:
     """A name for clips painted from this seed and these photos, whatever folder they lie in."""
-    digest = hashlib.sha256(str(seed).encode())
-    for photo in photos:
-        digest.update(photo.read_bytes())
-    return f"clips-{digest.hexdigest()[:12]}"
+    return stills.painted_name("clips", seed, photos)
 
 
 def _still(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:
     if not photos or rng.random() >= PHOTO_SHARE:
         return sample_background(rng, 3 * SIZE)
-    return _photo(photos[int(rng.integers(len(photos)))]).astype(np.float32) / 255
-
-
-@lru_cache(maxsize=256)
-def _photo(path: Path) -> np.ndarray:
-    return shrink(read_photo(path)[0], LONGEST)
+    return stills.still(photos[int(rng.integers(len(photos)))]).astype(np.float32) / 255
