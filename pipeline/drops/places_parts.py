@@ -52,9 +52,6 @@ class Cell:
         return at.astype(np.float32)
 
 
-FIT = Cell(0, 0, 1, 1)
-
-
 def offset(x: float, y: float, z: float) -> npt.NDArray[np.float64]:
     """The vector (3,)."""
     return np.array([x, y, z], np.float64)

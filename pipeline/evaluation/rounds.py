@@ -35,9 +35,9 @@ def score_rounds(
 def _round(folder: Path, files: Iterable[Files], threshold: float) -> dict[str, float]:
     shares, counts, psnrs = [], [], []
     for one in files:
-        mask, view = folder / "masks" / one.record.name, folder / "test" / one.record.name
-        if mask.is_file():
-            drop_mask = ~read_keep_mask(mask, one.record.size)
+        keep_file, view = folder / "masks" / one.record.name, folder / "test" / one.record.name
+        if keep_file.is_file():
+            drop_mask = ~read_keep_mask(keep_file, one.record.size)
             shares.append(float(drop_mask.mean()))
             if one.coverage is not None:
                 coverage = read_reference(one.coverage, one.record, one.source)[..., 0]

@@ -69,7 +69,7 @@ def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list
     ]
     if not photos:
         raise UserError(
-            "None of the photos with a pose is for fitting (every 8th is held out).",
+            "None of the photos with a pose is for fitting: all are held out (ingest.holdout).",
             "See poses/poses.json for the photos that were lost.",
         )
     return photos
@@ -84,7 +84,7 @@ class RayBuffer:
 
     def __init__(self, photos: Sequence[PosedPhoto], seed: int, device: str = "cpu") -> None:
         if not photos:
-            raise UserError("No photo is left to fit.", hint="check poses/poses.json")
+            raise UserError("No photo is left to fit.", "See poses/poses.json for why.")
         kept, colours, offsets = [], [], [0]
         for photo in photos:
             kept.append(np.flatnonzero(photo.keep_mask.ravel()) + offsets[-1])
@@ -142,7 +142,7 @@ def _soft_masks(photos: Sequence[PosedPhoto], device: str) -> Tensor | None:
         np.zeros(photo.keep_mask.shape) if photo.drop_mask is None else photo.drop_mask
         for photo in photos
     ]
-    bytes_ = [np.round(np.clip(mask, 0.0, 1.0).ravel() * 255.0).astype(np.uint8) for mask in soft]
+    bytes_ = [np.round(np.clip(one, 0.0, 1.0).ravel() * 255.0).astype(np.uint8) for one in soft]
     return torch.from_numpy(np.concatenate(bytes_)).to(device)
 
 

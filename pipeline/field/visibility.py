@@ -20,7 +20,7 @@ class Witness(NamedTuple):
 
 
 def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) -> np.ndarray:
-    """How many photos saw each pixel's surface uncovered, at every ``stride``-th pixel, uint8.
+    """How many photos saw each pixel's surface uncovered, at every ``stride``-th pixel, uint16.
 
     The surface is where the field's own depth puts it; a photo saw it when the point falls on a
     kept pixel whose depth agrees within 5 per cent.
@@ -37,7 +37,7 @@ def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) 
     world_from_cam = np.linalg.inv(view.cam_from_world)
     cam = np.stack([x * depth, y * depth, depth])
     points = world_from_cam[:3, :3] @ cam + world_from_cam[:3, 3:]
-    count = np.zeros(depth.size, np.uint8)
+    count = np.zeros(depth.size, np.uint16)
     for other in witnesses:
         count += _sees(other, points)
     return count.reshape(rows.shape)

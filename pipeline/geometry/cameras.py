@@ -19,16 +19,6 @@ def field_of_view_deg(focal_px: float, size_px: float) -> float:
     return math.degrees(2.0 * math.atan2(0.5 * size_px, focal_px))
 
 
-def focal_from_field_of_view(angle_deg: float, size_px: float) -> float:
-    """The focal length in pixels at which `size_px` pixels cover `angle_deg`, 0 < angle < 180."""
-    return 0.5 * size_px / math.tan(math.radians(0.5 * angle_deg))
-
-
-def scale_intrinsics(intrinsics: np.ndarray, factor_x: float, factor_y: float) -> np.ndarray:
-    """K (3, 3) of the same camera after its image was resized by the two factors."""
-    return np.diag([factor_x, factor_y, 1.0]) @ intrinsics
-
-
 def project(
     points: np.ndarray, cam_from_world: np.ndarray, intrinsics: np.ndarray, k1: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:

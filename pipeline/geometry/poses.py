@@ -1,8 +1,7 @@
-"""Poses: frames of other programs, averages, alignment of one set of cameras to another.
+"""Poses: averages, and the alignment of one set of cameras to another.
 
-Inside the project a pose is `cam_from_world`, 4x4 float64, camera axes x right, y down, z forward
-(OpenCV, COLMAP). Other conventions appear only as results or arguments of the functions named for
-them.
+A pose is `cam_from_world`, 4x4 float64, camera axes x right, y down, z forward (OpenCV, COLMAP). Other
+programs' conventions are met where their files are: `pipeline.io.transforms`, `pipeline.io.llff`.
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# A camera's axes, OpenGL (x right, y up, z back) in terms of OpenCV's, and the other way.
-_GL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _FEW_CENTRES = 1e-9
 
 
@@ -39,29 +36,6 @@ def invert(pose: np.ndarray) -> np.ndarray:
 def centre(cam_from_world: np.ndarray) -> np.ndarray:
     """The camera's centre (3,) in the world."""
     return invert(cam_from_world)[:3, 3]
-
-
-def opengl_from_cam_from_world(cam_from_world: np.ndarray) -> np.ndarray:
-    """The (4, 4) world-from-camera matrix with OpenGL axes: x right, y up, z back."""
-    return invert(cam_from_world) @ _GL_FLIP
-
-
-def cam_from_world_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
-    """The (4, 4) cam_from_world of an OpenGL world-from-camera matrix (3x4 or 4x4)."""
-    return invert(as_4x4(world_from_cam) @ _GL_FLIP)
-
-
-def llff_from_cam_from_world(cam_from_world: np.ndarray) -> np.ndarray:
-    """The (3, 4) world-from-camera matrix with LLFF's axes: down, right, back."""
-    world = opengl_from_cam_from_world(cam_from_world)[:3]
-    return np.stack([-world[:, 1], world[:, 0], world[:, 2], world[:, 3]], axis=1)
-
-
-def cam_from_world_from_llff(world_from_cam: np.ndarray) -> np.ndarray:
-    """The (4, 4) cam_from_world of a (3, 4) LLFF matrix with axes (down, right, back)."""
-    llff = np.asarray(world_from_cam, dtype=np.float64)
-    columns = [llff[:, 1], -llff[:, 0], llff[:, 2], llff[:, 3]]
-    return cam_from_world_from_opengl(np.stack(columns, axis=1))
 
 
 def rotation_angle_deg(rotation: np.ndarray) -> float:
@@ -108,14 +82,6 @@ def average_pose(cams: Sequence[np.ndarray]) -> np.ndarray:
     return invert(middle)
 
 
-def recentre(cams: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The cameras in the frame of their average pose, and its `average_from_world` (4, 4)."""
-    average_from_world = average_pose(list(cams.values()))
-    world_from_average = invert(average_from_world)
-    moved = {name: as_4x4(cam) @ world_from_average for name, cam in cams.items()}
-    return moved, average_from_world
-
-
 @dataclass(frozen=True)
 class Similarity:
     """target = scale * rotation @ source + translation."""
@@ -135,28 +101,6 @@ class Similarity:
         moved[:3, :3] = pose[:3, :3] @ self.rotation.T
         moved[:3, 3] = self.scale * pose[:3, 3] - moved[:3, :3] @ self.translation
         return moved
-
-
-def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity that takes points `source` (N, 3) nearest to `target` (N, 3), least squares.
-
-    Umeyama 1991, doi 10.1109/34.88573. Points on a plane leave no doubt, points on a line do.
-    ValueError for fewer than three points or points that all coincide.
-    """
-    source = np.asarray(source, dtype=np.float64)
-    target = np.asarray(target, dtype=np.float64)
-    if len(source) < 3 or source.shape != target.shape:
-        raise ValueError(f"needs three or more pairs of points, got {source.shape}, {target.shape}")
-    around_source = source - source.mean(axis=0)
-    around_target = target - target.mean(axis=0)
-    spread = float((around_source**2).sum())
-    if spread < _FEW_CENTRES:
-        raise ValueError("all source points coincide: no scale can be found")
-    left, values, right = np.linalg.svd(around_target.T @ around_source)
-    sign = np.array([1.0, 1.0, np.linalg.det(left @ right)])
-    rotation = left @ np.diag(sign) @ right
-    scale = float((values * sign).sum() / spread)
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
 
 
 def align_cameras(

@@ -9,26 +9,6 @@ import numpy as np
 from pipeline.geometry.poses import average_pose, centre, invert, nearest_rotation
 
 
-def is_forward_facing(cams: Sequence[np.ndarray], max_angle_deg: float = 40.0) -> bool:
-    """True when all cameras look within `max_angle_deg` of the mean direction, side by side.
-
-    That is, their centres spread less along the mean direction than across it, so that one near
-    plane can stand before all of them.
-    """
-    world = np.stack([invert(cam) for cam in cams])
-    towards = world[:, :3, 2].mean(axis=0)
-    length = float(np.linalg.norm(towards))
-    if length < 1e-6:
-        return False
-    towards = towards / length
-    if float((world[:, :3, 2] @ towards).min()) < np.cos(np.radians(max_angle_deg)):
-        return False
-    offsets = world[:, :3, 3] - world[:, :3, 3].mean(axis=0)
-    along = offsets @ towards
-    across = np.linalg.norm(offsets - along[:, None] * towards, axis=1)
-    return bool(np.abs(along).max() <= max(float(across.max()), 1e-9))
-
-
 def look_at(eye: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
     """The cam_from_world (4, 4) at `eye` that looks at `target`, image y towards `down`."""
     forward = np.asarray(target, dtype=np.float64) - eye

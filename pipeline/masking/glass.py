@@ -169,16 +169,6 @@ def pane_before(
     return pane_from_mean @ mean_camera(np.asarray(cams, np.float64))
 
 
-def pane_depths(pane_from_world: np.ndarray, camera: GlassCamera) -> tuple[float, float]:
-    """The nearest and the farthest depth at which a view's rays meet the pane; inf where none does."""
-    pane_from_cam = pane_from_world @ invert(camera.cam_from_world)
-    along = pane_from_cam[2, :3] @ _lattice(*camera[1:])
-    with np.errstate(divide="ignore"):
-        depth = -pane_from_cam[2, 3] / along
-    depth = depth[np.isfinite(depth) & (depth > 0)]
-    return (float(depth.min()), float(depth.max())) if depth.size else (math.inf, math.inf)
-
-
 def neighbours(count: int, middle: int, width: int) -> range:
     """The `width` neighbours in order of view `middle` among `count` views; 0: all of them."""
     if width <= 0 or width >= count:

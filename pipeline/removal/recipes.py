@@ -18,8 +18,6 @@ from pipeline.removal.quan import QuanNet
 from pipeline.removal.samples import Batch
 from pipeline.removal.wen import Frames, WenNet
 
-# Maps (N,1,H,W) of all recurrent steps, from photos (N,3,H,W), blue first.
-Attend = Callable[..., Sequence[Tensor]]
 MapLoss = Callable[[Sequence[Tensor], Tensor], Tensor]
 
 

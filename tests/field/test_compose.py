@@ -58,3 +58,10 @@ def test_a_surface_behind_or_before_what_the_photo_saw_does_not_count(depth: flo
     dry = np.ones((20, 20), bool)
     other = wall(0.0, dry)._replace(depth=np.full((20, 20), depth, np.float32))
     assert witness_count(wall(0.0, dry), [other], stride=1).max() == 0
+
+
+def test_a_long_video_is_counted_to_its_end() -> None:
+    """More witnesses than a byte holds: 256 are not none."""
+    dry = np.ones((20, 20), bool)
+    count = witness_count(wall(0.0, dry), [wall(0.0, dry)] * 256, stride=4)
+    assert (count == 256).all()

@@ -8,7 +8,6 @@ import pytest
 from pipeline.geometry.poses import average_pose, centre, invert, rotation_angle_deg
 from pipeline.geometry.trajectory import (
     interpolated_path,
-    is_forward_facing,
     look_at,
     spiral_path,
     tour_order,
@@ -42,16 +41,6 @@ def assert_rigid(path: list[np.ndarray]) -> None:
         assert cam.shape == (4, 4)
         assert np.allclose(cam[:3, :3] @ cam[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(cam[:3, :3]) == pytest.approx(1)
-
-
-def test_forward_facing_or_not(wall, ring):
-    assert is_forward_facing(wall)
-    assert not is_forward_facing(ring)
-    assert not is_forward_facing(ring[:6])
-    corridor = [look_at(np.array([0.0, 0, z]), np.array([0.0, 0, 50]), DOWN) for z in range(6)]
-    assert not is_forward_facing(corridor)
-    opposed = [look_at(np.zeros(3), np.array([0.0, 0, z]), DOWN) for z in (-1.0, 1.0)]
-    assert not is_forward_facing(opposed)
 
 
 def test_look_at_puts_the_target_on_the_axis():

@@ -12,7 +12,6 @@ from pipeline.masking.glass import (
     gather,
     neighbours,
     pane_before,
-    pane_depths,
     quantile_over_views,
 )
 
@@ -72,13 +71,6 @@ def test_the_raster_stays_within_its_limit() -> None:
     pane = pane_before(np.stack([v.cam_from_world for v in views]), 1.5)
     rows, columns = PaneGlass(pane, views, max_cells=1000).shape
     assert 800 < rows * columns < 1100
-
-
-def test_depths_of_a_facing_pane() -> None:
-    view = cameras(1)[0]._replace(cam_from_world=np.eye(4))
-    assert np.allclose(pane_depths(pane_before(np.eye(4)[None], 2.0), view), 2.0)
-    near, far = pane_depths(pane_before(np.eye(4)[None], 2.0, 0.0, 30.0), view)
-    assert near < 1.9 < 2.1 < far
 
 
 def test_on_the_lens_the_mean_is_the_one_of_equation_5() -> None:
