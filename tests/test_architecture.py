@@ -85,7 +85,6 @@ LONG_FUNCTIONS = {
     "pipeline/drops/places_street.py:house",
     "pipeline/drops/places_street.py:build",
     "pipeline/drops/places_things.py:stall",
-    "pipeline/masking/loop.py:repair",
     "pipeline/sfm/given.py:triangulate",
     "stages/report.py:main",
 }

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.masking.loop import Repaired, Round, describe
+from pipeline.masking.loop import Repaired, Round
+from pipeline.masking.seek import describe
 
 
 def account(done: Repaired, names: Sequence[str]) -> dict[str, Any]:

@@ -1,0 +1,117 @@
+"""All views' drop masks, redrawn from what was gathered on the glass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.masking.glass import Glass, PaneGlass, gather, neighbours
+from pipeline.masking.masks import automatic_threshold, dilate, threshold
+from pipeline.masking.remask import Redrawn, redraw
+
+MEANS = 0.6  # of the threshold of single maps
+FEWEST_ON_PANE = 2  # votes, without attention; with it a single view's residual has its say too
+SHARE_ON_LENS = 0.25
+SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
+
+
+class RedrawnViews(NamedTuple):
+    """New drop masks of all views, the residual gathered from all of them, and what it says.
+
+    `contrast` and `level` as in `Redrawn`; `known` is the share of the masks' pixels that enough views
+    voted on.
+    """
+
+    drop_masks: list[np.ndarray]
+    gathered: np.ndarray
+    contrast: float
+    level: float
+    known: float
+
+
+def redraw_views(
+    glass: Glass,
+    residuals: Sequence[np.ndarray | None],
+    drop_masks: Sequence[np.ndarray],
+    *,
+    quantile: float,
+    attentions: Sequence[np.ndarray] | None = None,
+    width: int = 0,
+    dilation: int = 0,
+) -> RedrawnViews:
+    """Every view's drop mask redrawn from the `residuals` (None: a view that was not fitted).
+
+    On the glass each cell takes the `quantile` of the residuals over its views; cells with fewer votes
+    than `fewest_votes` keep what the old masks say. The `attentions` of all views, gathered likewise,
+    have their say (see `redraw`). With a `width` above 0 a view takes the part of its `width` neighbours
+    only: drops may creep. The new masks are grown by `dilation` pixels.
+    """
+    count = len(drop_masks)
+    fitted = sum(values is not None for values in residuals)
+    fewest = fewest_votes(glass, min(width or fitted, fitted), attentions is not None)
+    cache: dict[range, Redrawn] = {}
+
+    def redrawn(views: range) -> Redrawn:
+        if views not in cache:
+            gathered, votes = gather(glass, residuals, views, quantile)
+            old, _ = gather(glass, [m.astype(np.float32) for m in drop_masks], views, None)
+            seen = None if attentions is None else gather(glass, attentions, views, None)[0]
+            reach = max(drop_masks[0].shape) / SURROUNDINGS
+            previous = np.nan_to_num(old) > 0.5
+            cache[views] = redraw(gathered, votes, previous, fewest, reach=reach, attention=seen)
+        return cache[views]
+
+    fresh, known = [], []
+    for view, old in enumerate(drop_masks):
+        found = redrawn(neighbours(count, view, width))
+        share = glass.to_view(view, found.drop_mask.astype(np.float32))
+        fresh.append(dilate(np.where(np.isfinite(share), share > 0.5, old), dilation))
+        known.append(np.nan_to_num(glass.to_view(view, found.known.astype(np.float32))).mean())
+    facts = list(cache.values())
+    gathered, _ = gather(glass, residuals, range(count), quantile)
+    return RedrawnViews(
+        fresh,
+        np.nan_to_num(gathered),
+        float(np.median([found.contrast for found in facts])),
+        float(np.median([found.level for found in facts])),
+        float(np.mean(known)),
+    )
+
+
+def fewest_votes(glass: Glass, views: int, with_attention: bool) -> int:
+    """How many of the `views` must look at a place of the glass for it to be redrawn."""
+    if isinstance(glass, PaneGlass):
+        return 1 if with_attention else FEWEST_ON_PANE
+    return max(2, round(SHARE_ON_LENS * views))
+
+
+def attention_on_glass(
+    glass: Glass,
+    attentions: Sequence[np.ndarray],
+    drop_masks: Sequence[np.ndarray],
+    width: int = 0,
+    dilation: int = 0,
+) -> list[np.ndarray]:
+    """Equation 5 where the glass is: drop masks from the maps' mean there.
+
+    The mean alone, without the view's own map beside it. The threshold is chosen from the single maps; a
+    mean seldom reaches their heights. Off the glass the old mask stays.
+    """
+    t = MEANS * automatic_threshold(attentions)
+    count = len(attentions)
+    cache: dict[range, np.ndarray] = {}
+    fresh = []
+    for view, old in enumerate(drop_masks):
+        views = neighbours(count, view, width)
+        if views not in cache:
+            cache[views] = gather(glass, attentions, views, None)[0]
+        mean = glass.to_view(view, cache[views])
+        fresh.append(np.where(np.isfinite(mean), dilate(threshold(mean, t), dilation), old))
+    return fresh
+
+
+def changed_share(old: Sequence[np.ndarray], new: Sequence[np.ndarray]) -> float:
+    """The share of pixels, over all views, whose mask changed."""
+    return float(np.mean([(a != b).mean() for a, b in zip(old, new, strict=True)]))
