@@ -8,6 +8,7 @@ from typing import Any
 _MODES = {
     "lens-fixed": "The drops stay where they are on the lens",
     "per-image": "Each photo has drops of its own",
+    "given": "The masks are not ours",
 }
 _PHOTO = (
     ("masks.coverage", "{:.1%} dropped"),
@@ -30,7 +31,8 @@ def masks_note(about: Mapping[str, Any]) -> str:
     if not about:
         return "Nothing is known of how the masks were made."
     mode = _MODES.get(str(about.get("mode")), "The masks were made as they are")
-    return f"{mode}: {about.get('why', 'for no given reason')}. Threshold {about.get('threshold')}."
+    cut = f" Threshold {about['threshold']}." if "threshold" in about else ""
+    return f"{mode}: {about.get('why', 'for no given reason')}.{cut}"
 
 
 def rounds_note(about: Mapping[str, Any], scores: Mapping[str, Mapping[str, float]]) -> str:
@@ -46,8 +48,10 @@ def rounds_note(about: Mapping[str, Any], scores: Mapping[str, Mapping[str, floa
         if "test_psnr" in score:
             text += f", a brief fit on them {score['test_psnr']:.1f} dB"
         rounds.append(text)
-    course = f" {'; '.join(rounds)}." if rounds else ""
-    return f" Repaired from the scene: {about.get('why', 'for no given reason')}.{course}"
+    why = about.get("why", "for no given reason")
+    if not rounds:
+        return f" They were not repaired from the scene: {why}."
+    return f" Repaired from the scene: {why}. {'; '.join(rounds)}."
 
 
 def poses_note(account: Mapping[str, Any], total: int) -> str:

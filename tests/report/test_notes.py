@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pipeline.report.notes import rounds_note
+from pipeline.report.notes import masks_note, rounds_note
 
 
 def test_the_rounds_are_told_in_their_order_with_what_is_known() -> None:
@@ -15,3 +15,13 @@ def test_the_rounds_are_told_in_their_order_with_what_is_known() -> None:
         in note
     )
     assert rounds_note({}, {}) == ""
+
+
+def test_masks_that_came_along_have_no_threshold_and_no_rounds() -> None:
+    why = "they came with the photos (rainMask.npy)"
+    assert masks_note({"mode": "given", "why": why}) == f"The masks are not ours: {why}."
+    assert masks_note({"mode": "per-image", "why": "w", "threshold": 0.25}).endswith(
+        ": w. Threshold 0.25."
+    )
+    untouched = rounds_note({"mode": "none", "why": why, "rounds": {}}, {})
+    assert untouched == f" They were not repaired from the scene: {why}."
