@@ -7,7 +7,7 @@ export PATH := $(abspath $(BIN)):$(PATH)
 .PHONY: demo test check format setup scene tables report synth clean
 
 demo: setup
-	dvc repro --glob '*@demo*'
+	dvc repro report@demo
 	@python -m pipeline.evaluation.table artifacts/demo/metrics.json artifacts/demo/unmasked/metrics.json
 	@echo "Open $(abspath artifacts/demo/report/index.html)"
 
@@ -26,7 +26,7 @@ format: setup
 
 # make scene SCENE=garden: everything for one scene of params.yaml
 scene: setup
-	dvc repro --glob '*@$(SCENE)'
+	dvc repro report@$(SCENE)
 	@python -m pipeline.evaluation.table artifacts/$(SCENE)/metrics.json
 	@echo "Open $(abspath artifacts/$(SCENE)/report/index.html)"
 

@@ -69,6 +69,54 @@ def test_dvc_lists_the_parameters_that_a_stage_reads(name: str) -> None:
     assert set(entry["params"]) == expected
 
 
+def test_a_scenes_page_needs_every_stage_of_it_and_of_its_comparison() -> None:
+    """`make demo` asks DVC for the page alone: it must bring everything else along.
+
+    (By a pattern it would not do: DVC runs all scenes where a pattern fits none.)
+    """
+    items = {"${key}": "demo", "${item.scene}": "demo", "${item.variant}": "unmasked"}
+    items["${item.report.compare}"] = "unmasked"
+
+    def filled(paths: list[str]) -> set[str]:
+        for mark, word in items.items():
+            paths = [path.replace(mark, word) for path in paths]
+        return set(paths)
+
+    stages = _stages()
+    makes = {
+        name: filled([*entry["outs"], *entry.get("metrics", [])]) for name, entry in stages.items()
+    }
+    found, ahead = {"report"}, ["report"]
+    while ahead:
+        needs = filled(stages[ahead.pop()]["deps"])
+        for name, outs in makes.items():
+            below = any(need == out or need.startswith(f"{out}/") for need in needs for out in outs)
+            if below and name not in found:
+                found.add(name)
+                ahead.append(name)
+    assert found == set(stages)
+    recipes = (ROOT / "Makefile").read_text()
+    assert "dvc repro report@demo" in recipes and "dvc repro report@$(SCENE)" in recipes
+
+
+def test_no_file_that_is_read_can_run_code() -> None:
+    """No pickle, no eval, and what could unpickle is told not to."""
+    guards = {"load": {"torch": ("weights_only", True), "np": ("allow_pickle", False)}}
+    for path, text in _sources().items():
+        for node in ast.walk(ast.parse(text)):
+            if not isinstance(node, ast.Call):
+                continue
+            assert not ast.unparse(node.func).startswith(("pickle.", "yaml.", "joblib.")), path
+            if isinstance(node.func, ast.Name):
+                assert node.func.id not in ("eval", "exec"), f"{path}:{node.lineno}"
+            if isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name):
+                key, safe = guards.get(node.func.attr, {}).get(node.func.value.id, (None, None))
+                given = {word.arg: getattr(word.value, "value", None) for word in node.keywords}
+                # NumPy refuses by itself; torch only since 2.6.
+                default = False if key == "allow_pickle" else None
+                assert key is None or given.get(key, default) is safe, f"{path}:{node.lineno}"
+
+
 def test_imports_run_one_way() -> None:
     linter = Path(sys.executable).with_name("lint-imports")
     done = subprocess.run([linter, "--no-cache"], cwd=ROOT, capture_output=True, text=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 from pathlib import Path
 
@@ -39,7 +40,27 @@ def test_quoted_messages_stand_in_the_code(message: str) -> None:
     assert re.search(pattern, texts), f"no message reads: {message}"
 
 
-@pytest.mark.parametrize("page", [*sorted(ROOT.glob("docs/*.md")), ROOT / "README.md"])
+PAGES = [
+    path
+    for pattern in ("*.md", "docs/**/*.md", "weights/**/*.md", "experiments/*/*.md")
+    for path in sorted(ROOT.glob(pattern))
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_and_parameters_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for module in re.findall(
+        r"python -m ((?:stages|pipeline|experiments|benchmarks)[.\w]*\w)", text
+    ):
+        assert module == "stages" or (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
+    for section, key in re.findall(r"`([a-z_]+)\.([a-z_0-9]+)(?:: [^`]*)?`", text):
+        if (ROOT / f"stages/{section}.py").is_file() and key not in ("json", "py", "csv"):
+            fields = importlib.import_module(f"stages.{section}").Params.model_fields
+            assert key in fields, f"{section}.{key}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
