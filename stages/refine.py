@@ -38,7 +38,7 @@ class Params(Section):
     steps: Annotated[int, Field(ge=1)]
     batch_rays: Annotated[int, Field(ge=64, le=65536)]
     quantile: Annotated[float, Field(ge=0, le=1)]
-    window: Annotated[int, Field(ge=0)]
+    window: Annotated[int, Field(ge=0)] | Literal["auto"]
     witnesses: Annotated[int, Field(ge=0)]
     dilation: Annotated[int, Field(ge=0, le=100)]
     contrast: Annotated[float, Field(ge=1)]

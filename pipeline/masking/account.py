@@ -42,6 +42,7 @@ def _round(one: Round) -> Mapping[str, Any]:
         "coverage": round(float(np.mean(one.drop_masks)), 6),
         "changed": round(one.changed, 6),
         "glass": describe(one.found),
+        "window": one.window,
         "lens_agreement": round(one.found.lens_agreement, 4),
         "pane_agreement": round(one.found.pane_agreement, 4),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -13,11 +13,13 @@ from pipeline.masking.glass import GlassCamera, PaneGlass
 from pipeline.masking.seek import Seeker, Wish, cover, describe, shown
 from pipeline.masking.sweep import Found
 from pipeline.masking.views import RedrawnViews, attention_on_glass, changed_share, redraw_views
+from pipeline.masking.window import alike_by_distance, chosen_window
 
 log = logging.getLogger(__name__)
 
 # The residual (H, W) of every view, None where it was not fitted, for given drop masks and glass.
 Look = Callable[[Sequence[np.ndarray], Found], Sequence[np.ndarray | None]]
+Window = int | Literal["auto"]
 STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains more than it blurs
 CLEAR = 0.6  # agreement of the residual on the glass from which it adds to what the attention told
 
@@ -25,12 +27,14 @@ CLEAR = 0.6  # agreement of the residual on the glass from which it adds to what
 class Round(NamedTuple):
     """The state after a round: round 0 is the start, before any fit.
 
-    `found` is the glass that the round went by, `changed` the share of pixels whose mask it changed,
-    `redrawn` what the residual said (None for the start).
+    `found` is the glass that the round went by, `window` the number of neighbouring photos that it
+    gathered over (0: all), `changed` the share of pixels whose mask it changed, `redrawn` what the residual
+    said (None for the start).
     """
 
     drop_masks: list[np.ndarray]
     found: Found
+    window: int
     changed: float
     redrawn: RedrawnViews | None
 
@@ -55,7 +59,7 @@ def repair(
     use_attention: bool = True,
     gather_attention: bool = True,
     quantile: float = 0.5,
-    window: int = 0,
+    window: Window = "auto",
     dilation: int = 0,
     contrast: float = 2.0,
     settled: float = 0.002,
@@ -68,38 +72,51 @@ def repair(
     (the general form of equation 5). The loop ends early when fewer than the share `settled` of the
     pixels change, and keeps the masks that it had when the residual shows no glass, when it agrees
     there less than is needed to add to the attention (a poor field disagrees everywhere), or when the
-    disagreement inside the new masks is not `contrast` times that outside. Other parameters as in
-    `redraw_views`.
+    disagreement inside the new masks is not `contrast` times that outside. `window` auto: see
+    `chosen_window`, for drops on the lens; on a pane, where the views are moved until they cover each
+    other and few share a place, all views are gathered. Other parameters as in `redraw_views`.
     """
     told = attentions if use_attention else None
     seeker = Seeker(cameras, farthest, agreement, mode)
     found, glass = seeker.first(attentions)
+    width = _width(window, found, attentions, cameras)
     masks, doubt = list(drop_masks), ""
     if use_attention and isinstance(glass, PaneGlass) and (c := cover(glass, attentions)) < STEADY:
         doubt = f"the views do not cover each other well enough on the pane ({c:.2f})"
     if gather_attention and found.mode != "none" and not doubt:
-        masks = attention_on_glass(glass, attentions, masks, window, dilation)
-    done = [Round(masks, found, changed_share(drop_masks, masks), None)]
-    redrawn_on = partial(
-        redraw_views, quantile=quantile, attentions=told, width=window, dilation=dilation
-    )
+        masks = attention_on_glass(glass, attentions, masks, width, dilation)
+    done = [Round(masks, found, width, changed_share(drop_masks, masks), None)]
+    redrawn_on = partial(redraw_views, quantile=quantile, attentions=told, dilation=dilation)
     while not doubt and len(done) <= rounds:
         old = done[-1].drop_masks
         residuals = look(old, found)
         found, glass = seeker.again(residuals, (found, glass), told)
         if doubt := _doubt(found, use_attention):
             break
-        redrawn = redrawn_on(glass, residuals, old)
+        width = _width(window, found, residuals if told is None else told, cameras)
+        redrawn = redrawn_on(glass, residuals, old, width=width)
         if not redrawn.contrast >= contrast:
             doubt = f"the disagreement is only {redrawn.contrast:.1f} times as large on it"
             break
         changed = changed_share(old, redrawn.drop_masks)
-        done.append(Round(redrawn.drop_masks, found, changed, redrawn))
+        done.append(Round(redrawn.drop_masks, found, width, changed, redrawn))
         log.info("round %d: %s, %.1f %% masked, %.2f %% of the pixels changed", len(done) - 1,
                  describe(found), 100 * np.mean(redrawn.drop_masks), 100 * changed)  # fmt: skip
         if changed < settled:
             return Repaired(done, "the masks have settled")
     return Repaired(done, doubt or "all rounds were made")
+
+
+def _width(
+    window: Window,
+    found: Found,
+    maps: Sequence[np.ndarray | None],
+    cameras: Sequence[GlassCamera],
+) -> int:
+    """The window in photos, 0 for all; auto looks how far apart `maps` still agree on the lens."""
+    if window != "auto":
+        return window
+    return chosen_window(alike_by_distance(maps, cameras)) if found.mode == "lens" else 0
 
 
 def _doubt(found: Found, use_attention: bool) -> str:

@@ -14,20 +14,22 @@ FLOOR = 1e-3  # residuals below it are equal: 8-bit photos hold no less
 LARGEST_HOLE = 0.25  # of the drop around it
 SUREST = 0.02  # attention is never taken for more certain than this
 ATTENTION_WEIGHT = 1.0  # of its log-odds against the log of the residual
-# Where a drop begins, between the clear median (0) and Otsu's threshold (1). Later with attention, whose
-# log-odds fall off slowly around a drop.
-JOIN, JOIN_ATTENTION = 0.5, 0.7
+LEAST = 0.05  # the margin of a cell that only its neighbours turned
+UNKNOWN = 0.5  # the margin of a cell that keeps its old mask
 
 
 class Redrawn(NamedTuple):
     """A drop mask on the glass and what it rests on.
 
-    `drop_mask` bool; `known`: cells with votes enough to decide; `level`: how many times its
+    `drop_mask` bool; `margin`: how far a cell is from the drop's rim, in units of the way from the clear
+    median to Otsu's threshold, within -1 and 1, above 0 where `drop_mask`: where a rim runs between two
+    cells; `known`: cells with votes enough to decide; `level`: how many times its
     surroundings' the residual must be where a drop begins, without other evidence; `contrast`: median
     residual inside the drops over that outside; NaN without either.
     """
 
     drop_mask: np.ndarray
+    margin: np.ndarray
     known: np.ndarray
     level: float
     contrast: float
@@ -40,6 +42,7 @@ def redraw(
     fewest_votes: int,
     *,
     reach: float,
+    join: float,
     attention: np.ndarray | None = None,
 ) -> Redrawn:
     """The drop mask on the glass from the gathered residual; `previous` where too few views voted.
@@ -47,17 +50,17 @@ def redraw(
     What counts is the logarithm of the residual over that of the clear surroundings within `reach`
     cells: a field is worse in foliage than on a road, and drops are smaller than either. The log-odds
     of the gathered `attention`, where there is one, add to it. Otsu's threshold tells what surely is a
-    drop; part of the way down to the clear median its surroundings join it. Then an opening 3x3, and
-    holes are filled: water has none.
+    drop; what lies `join` of the way up to it from the clear median joins such a drop nearby. Then an
+    opening 3x3, and holes are filled: water has none.
     """
     known = np.isfinite(gathered) & (votes >= fewest_votes)
     if known.sum() < 2:
-        return Redrawn(previous.copy(), known, float("nan"), float("nan"))
+        margin = np.where(previous, UNKNOWN, -UNKNOWN).astype(np.float32)
+        return Redrawn(previous.copy(), margin, known, float("nan"), float("nan"))
     logs = np.log(np.maximum(np.where(known, gathered, 1.0), FLOOR)).astype(np.float32)
     above = _above_surroundings(logs, known, reach)
-    score, join = above, JOIN
+    score = above
     if attention is not None:
-        join = JOIN_ATTENTION
         odds = np.clip(np.nan_to_num(attention, nan=0.5), SUREST, 1 - SUREST)
         odds = np.log(odds / (1 - odds))
         score = above + ATTENTION_WEIGHT * (odds - np.median(odds[known]))
@@ -66,13 +69,16 @@ def redraw(
     begin = middle + join * (sure - middle)
     # Old masks stand in where nobody can tell: as holes they would take their neighbours along.
     wide, seeds = (np.where(known, score > level, previous) for level in (begin, sure))
-    drop_mask = without_holes(joined(wide, seeds))
+    drop_mask = np.where(known, without_holes(joined(wide, seeds)), previous)
     inside, outside = gathered[known & drop_mask], gathered[known & ~drop_mask]
     contrast = float("nan")
     if inside.size and outside.size:
         contrast = float(np.median(inside) / max(float(np.median(outside)), FLOOR))
     level = float(np.exp(begin - middle))
-    return Redrawn(np.where(known, drop_mask, previous), known, level, contrast)
+    way = np.clip((score - begin) / max(sure - middle, 1e-6), -1, 1)
+    way = np.where(drop_mask, np.maximum(way, LEAST), np.minimum(way, -LEAST))
+    margin = np.where(known, way, np.where(drop_mask, UNKNOWN, -UNKNOWN)).astype(np.float32)
+    return Redrawn(drop_mask, margin, known, level, contrast)
 
 
 def _above_surroundings(logs: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:

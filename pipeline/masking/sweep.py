@@ -88,7 +88,7 @@ def find_glass(
         np.linspace(0, len(maps) - 1, min(len(maps), MOST_VIEWS)).round().astype(int)
     )
     maps, cameras = [maps[i] for i in chosen], [cameras[i] for i in chosen]
-    coarse, coarse_cameras = _prepared(maps, cameras, COARSE)
+    coarse, coarse_cameras = prepared(maps, cameras, COARSE)
     lens = agreement(_stack(LensGlass(*coarse[0].shape), coarse))
     cams = np.stack([camera.cam_from_world for camera in cameras])
     if start is None:
@@ -99,7 +99,7 @@ def find_glass(
         tried = [(0.0, (float(start[0]), float(start[1]), float(start[2])))]
     if not tried:
         return Found("lens" if lens >= at_least else "none", lens, 0.0, None, 0.0, 0.0, 0.0)
-    fine, fine_cameras = _prepared(maps, cameras, FINE)
+    fine, fine_cameras = prepared(maps, cameras, FINE)
     best, plane = max(
         (
             _refined(place, (coarse, coarse_cameras), (fine, fine_cameras), cams, farthest)
@@ -116,7 +116,7 @@ def find_glass(
 def agreement_on(glass: PaneGlass, maps: Sequence[np.ndarray | None]) -> float:
     """How well the views' maps agree on a pane as it stands, the views where `glass.moved` has them."""
     known = [view for view, values in enumerate(maps) if values is not None]
-    fine, cameras = _prepared(
+    fine, cameras = prepared(
         [values for values in maps if values is not None], [glass.cameras[v] for v in known], FINE
     )
     own = PaneGlass(glass.pane_from_world, cameras, max_cells=3 * fine[0].size)
@@ -217,10 +217,10 @@ def _stack(glass: Glass, maps: list[np.ndarray]) -> np.ndarray:
     return np.stack([glass.from_view(view, values) for view, values in enumerate(maps)])
 
 
-def _prepared(
+def prepared(
     maps: Sequence[np.ndarray], cameras: Sequence[GlassCamera], longest: int
 ) -> tuple[list[np.ndarray], list[GlassCamera]]:
-    """Maps and cameras at a smaller size, the maps without their broad gradients."""
+    """Maps and cameras with `longest` pixels on their longer side, the maps without broad gradients."""
     out, small = [], []
     for values, camera in zip(maps, cameras, strict=True):
         height, width = values.shape

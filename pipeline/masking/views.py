@@ -14,6 +14,10 @@ from pipeline.masking.remask import Redrawn, redraw
 MEANS = 0.6  # of the threshold of single maps
 FEWEST_ON_PANE = 2  # votes, without attention; with it a single view's residual has its say too
 SHARE_ON_LENS = 0.25
+# Where a drop begins, between the clear median (0) and Otsu's threshold (1). Later with attention, whose
+# log-odds fall off slowly around a drop, and latest on a pane, where what views still miss each other by
+# smears them.
+JOIN, JOIN_ON_LENS, JOIN_ON_PANE = 0.5, 0.75, 0.85
 SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
 
 
@@ -51,6 +55,9 @@ def redraw_views(
     count = len(drop_masks)
     fitted = sum(values is not None for values in residuals)
     fewest = fewest_votes(glass, min(width or fitted, fitted), attentions is not None)
+    join = JOIN
+    if attentions is not None:
+        join = JOIN_ON_PANE if isinstance(glass, PaneGlass) else JOIN_ON_LENS
     cache: dict[range, Redrawn] = {}
 
     def redrawn(views: range) -> Redrawn:
@@ -60,14 +67,16 @@ def redraw_views(
             seen = None if attentions is None else gather(glass, attentions, views, None)[0]
             reach = max(drop_masks[0].shape) / SURROUNDINGS
             previous = np.nan_to_num(old) > 0.5
-            cache[views] = redraw(gathered, votes, previous, fewest, reach=reach, attention=seen)
+            cache[views] = redraw(
+                gathered, votes, previous, fewest, reach=reach, join=join, attention=seen
+            )
         return cache[views]
 
     fresh, known = [], []
     for view, old in enumerate(drop_masks):
         found = redrawn(neighbours(count, view, width))
-        share = glass.to_view(view, found.drop_mask.astype(np.float32))
-        fresh.append(dilate(np.where(np.isfinite(share), share > 0.5, old), dilation))
+        margin = glass.to_view(view, found.margin)
+        fresh.append(dilate(np.where(np.isfinite(margin), margin > 0, old), dilation))
         known.append(np.nan_to_num(glass.to_view(view, found.known.astype(np.float32))).mean())
     facts = list(cache.values())
     gathered, _ = gather(glass, residuals, range(count), quantile)

@@ -56,7 +56,7 @@ def test_a_drop_is_where_the_residual_is_large_and_old_masks_stay_where_nobody_v
     gathered[:, 35:] = np.nan
     previous = np.zeros((30, 40), bool)
     previous[20:25, 28:38] = True
-    found = redraw(gathered, votes, previous, 2, reach=8)
+    found = redraw(gathered, votes, previous, 2, reach=8, join=0.5)
     expected = np.zeros((30, 40), bool)
     expected[5:15, 5:15] = True
     expected[20:25, 30:38] = True
@@ -71,7 +71,7 @@ def test_cells_without_votes_do_not_eat_the_drop_around_them() -> None:
     wet = np.hypot(*(np.indices((60, 60)) - 30)) < 12
     gathered = np.where(wet, 0.1, 0.01 + 0.002 * rng.random(wet.shape)).astype(np.float32)
     votes = np.where(rng.random(wet.shape) < 0.4, 0, 9)  # scattered: no 3x3 square is without one
-    found = redraw(gathered, votes, wet, 2, reach=10)
+    found = redraw(gathered, votes, wet, 2, reach=10, join=0.5)
     # But for corners that no 3x3 square fits into.
     assert (found.drop_mask & wet).sum() > 0.97 * wet.sum()
     assert not (found.drop_mask & ~wet).any()
@@ -79,7 +79,9 @@ def test_cells_without_votes_do_not_eat_the_drop_around_them() -> None:
 
 def test_without_any_votes_the_old_mask_stays() -> None:
     previous = np.eye(5, dtype=bool)
-    found = redraw(np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1, reach=2)
+    found = redraw(
+        np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1, reach=2, join=0.5
+    )
     assert np.array_equal(found.drop_mask, previous)
     assert math.isnan(found.contrast)
 
