@@ -37,6 +37,7 @@ class Params(Section):
     published_edges: Annotated[
         bool, Field(description="quan: two empty edge channels, as released")
     ]
+    keep_clear: Annotated[bool, Field(description="wen: what its map calls clear stays the photo")]
 
 
 def main(job: Job, params: Params) -> str:
@@ -78,7 +79,7 @@ def clean_one(
     networks = networks_of(params.method, weights, digest, device)
     if params.method == "wen":
         frames = [read_image(path) for path in window]
-        write_image(out, clean_wen(networks[0], frames, place))  # type: ignore[arg-type]
+        write_image(out, clean_wen(networks[0], frames, place, keep_clear=params.keep_clear))  # type: ignore[arg-type]
         return
     image = read_image(window[place])
     if params.method == "quan":

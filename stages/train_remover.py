@@ -17,7 +17,7 @@ from pipeline.io.atomic import write_csv
 from pipeline.parallel import map_named
 from pipeline.removal import clips, store
 from pipeline.removal.losses import PerceptualLoss
-from pipeline.removal.recipes import recipe_of
+from pipeline.removal.recipes import Added, recipe_of
 from pipeline.removal.samples import Pairs
 from pipeline.removal.training import CURVE, Plan, Trainer, curve_rows, fit
 from pipeline.stage import Job, Section, run
@@ -48,6 +48,7 @@ class Params(Section):
     attention_steps: Annotated[int, Field(ge=1, le=8)]
     published_edges: bool
     single_share: Share
+    added: Added
     attgan: Plan
     quan: Plan
     wen: Plan
@@ -87,7 +88,7 @@ def _trainer(job: Job, params: Params, method: Method) -> Trainer:
     attention = load_network(job.resolve(params.attention)) if method == "attgan" else None
     recipe = recipe_of(method, params.seed, attention=attention, map_loss=attention_loss,
                        train_attention=params.train_attention, steps=params.attention_steps,
-                       published_edges=params.published_edges)  # fmt: skip
+                       published_edges=params.published_edges, added=params.added)  # fmt: skip
     backbone = PerceptualLoss(job.resolve(params.perceptual), method) if params.perceptual else None
     recipe.to(job.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     made = _painted(job, pools, params.photos, params.seed, params.painted)
@@ -109,8 +110,7 @@ def _painted(job: Job, room: ModuleType, folder: str, seed: int, count: int) -> 
     chunks = {f"{k:04d}": (work / f"{k:04d}.npy", seed, k, photos)
               for k in range(-(-count // room.CHUNK))}  # fmt: skip
     map_named(room.paint_chunk, chunks, job_label="painting")
-    parts = [room.read_chunk(chunk[0]) for chunk in chunks.values()]
-    return pools.together(parts, count)
+    return pools.together([room.read_chunk(chunk[0]) for chunk in chunks.values()], count)
 
 
 if __name__ == "__main__":

@@ -85,11 +85,11 @@ def pair_cases(folder: Path) -> Iterator[Case]:
                    coverage_of_pair(rainy, clean) > 0)  # fmt: skip
 
 
-def restored(method: str, weights: Path, case: Case) -> np.ndarray:
+def restored(method: str, weights: Path, case: Case, keep_clear: bool) -> np.ndarray:
     """The photo as the stage `restore` makes it."""
     networks = networks_of(method, weights, "", "cpu")
     if method == "wen":
-        return clean_wen(networks[0], case.window, case.index)  # type: ignore[arg-type]
+        return clean_wen(networks[0], case.window, case.index, keep_clear=keep_clear)  # type: ignore[arg-type]
     if method == "quan":
         return clean_quan(networks[0], case.window[case.index])  # type: ignore[arg-type]
     attend = partial(_last_map, networks[0])
@@ -114,6 +114,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=8, help="painted pictures passed over")
     parser.add_argument("--count", type=int, default=24, help="painted pictures scored")
     parser.add_argument("--scratch", type=Path, default=Path("artifacts/.work/demo/train_remover"))
+    parser.add_argument("--plain", action="store_true", help="wen: all pixels from the network")
     parser.add_argument("--out", type=Path, required=True)
     flags = parser.parse_args()
     weights = flags.weights or Path(f"weights/removers/{flags.method}.safetensors")
@@ -126,7 +127,7 @@ def main() -> None:
     lines = []
     for case in (case for each in cases for case in each):
         rainy = case.window[case.index]
-        done = restored(flags.method, weights, case)
+        done = restored(flags.method, weights, case, not flags.plain)
         row = [*figures(rainy, case), *figures(done, case)]
         rows.setdefault(case.group, []).append(row)
         lines.append([case.group, case.name, *(round(value, 4) for value in row)])

@@ -40,13 +40,20 @@ def clean_quan(network: QuanNet, image: np.ndarray, *, published: bool = True) -
     return _picture(full[..., : rgb.shape[-2], : rgb.shape[-1]])
 
 
-def clean_wen(network: WenNet, window: Sequence[np.ndarray], index: int) -> np.ndarray:
-    """Frame `index` of a window of frames (H,W,3) without its drops; five frames were trained on."""
+def clean_wen(
+    network: WenNet, window: Sequence[np.ndarray], index: int, *, keep_clear: bool = False
+) -> np.ndarray:
+    """Frame `index` of a window of frames (H,W,3) without its drops; five frames were trained on.
+
+    keep_clear: where the network's map says so, the photo stays as it is (`wen.mend`).
+    """
     device = next(network.parameters()).device
     rgb = torch.cat([_planes(image, device) for image in window])
     with torch.inference_mode():
         frames = _padded(rgb, wen.MULTIPLE) * 2.0 - 1.0
-        full = (network(frames[None]).full[0, index : index + 1] + 1.0) / 2.0
+        found = network(frames[None])
+        whole = wen.mend(frames[None], found) if keep_clear else found.full
+        full = (whole[0, index : index + 1] + 1.0) / 2.0
     return _picture(full[..., : rgb.shape[-2], : rgb.shape[-1]])
 
 

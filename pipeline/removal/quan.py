@@ -82,6 +82,10 @@ class QuanNet(nn.Module):
 
     def forward(self, rgb: Tensor, *, published: bool = True) -> Tensor:
         """The dry pictures (N,3,H,W), not clamped, of rgb (N,3,H,W) in [0,1]; sides multiples of 4."""
+        return self.dec1_0(self.decoded(rgb, published=published)[-1])
+
+    def decoded(self, rgb: Tensor, *, published: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        """What the decoder holds at a quarter (128 channels), half (64) and full size (32)."""
         attention = shape_attention(rgb, published=published)
         shape1 = F.relu(self.att1_1(attention))
         shape2 = F.relu(self.att2_1(shape1))
@@ -90,10 +94,10 @@ class QuanNet(nn.Module):
         skip1 = self._blocks("enc1", (2, 3, 4), x, shape1)
         skip2 = self._blocks("enc2", (2, 3, 4), F.relu(self.enc2_1(skip1)), shape2)
         x = self._blocks("enc3", (2, 3, 4), F.relu(self.enc3_1(skip2)), shape3)
-        x = self._blocks("dec3", (3, 2, 1), x, shape3)
-        x = self._blocks("dec2", (3, 2, 1), F.relu(self.dec2_4(x)) + skip2, shape2)
-        x = self._blocks("dec1", (3, 2, 1), F.relu(self.dec1_4(x)) + skip1, shape1)
-        return self.dec1_0(x)
+        quarter = self._blocks("dec3", (3, 2, 1), x, shape3)
+        half = self._blocks("dec2", (3, 2, 1), F.relu(self.dec2_4(quarter)) + skip2, shape2)
+        full = self._blocks("dec1", (3, 2, 1), F.relu(self.dec1_4(half)) + skip1, shape1)
+        return quarter, half, full
 
     def _blocks(self, level: str, numbers: tuple[int, ...], x: Tensor, shape: Tensor) -> Tensor:
         for number in numbers:

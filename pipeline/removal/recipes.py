@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +17,7 @@ from pipeline.removal.critics import AttentiveCritic, Critic, PatchCritic
 from pipeline.removal.losses import wen_loss
 from pipeline.removal.quan import QuanNet
 from pipeline.removal.samples import Batch
-from pipeline.removal.wen import Frames, WenNet
+from pipeline.removal.wen import Frames, WenNet, mend
 
 MapLoss = Callable[[Sequence[Tensor], Tensor], Tensor]
 
@@ -28,6 +29,26 @@ class Outcome(NamedTuple):
     fake: Tensor
     real: Tensor
     attention: Tensor
+
+
+@dataclass(frozen=True)
+class Added:
+    """What is added to the published losses, so that minutes of training get somewhere.
+
+    quan_squares: the weight of mean squares beside the mean absolutes. quan_guides: of two products
+    that read the change a photo needs, and its drops, out of the decoder; they are not part of the
+    network. wen_mended: of mean squares of the photo where the map says clear, of the network elsewhere.
+    """
+
+    quan_squares: float = 0
+    quan_guides: float = 0
+    wen_mended: float = 0
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}  # of params.yaml
+
+    def __post_init__(self) -> None:
+        if min(self.quan_squares, self.quan_guides, self.wen_mended) < 0:
+            raise ValueError("weights of losses are 0 or more")
 
 
 class AttganRecipe(nn.Module):
@@ -76,17 +97,33 @@ class QuanRecipe(nn.Module):
 
     multiple, clips = quan.MULTIPLE, False
 
-    def __init__(self, *, published_edges: bool) -> None:
+    def __init__(self, added: Added, *, published_edges: bool) -> None:
         super().__init__()
-        self.network, self.published_edges = QuanNet(), published_edges
+        self.network, self.published_edges, self.added = QuanNet(), published_edges, added
+        self.guides = nn.ModuleList(nn.Conv2d(channels, 4, 1) for channels in (128, 64))
 
     def begin(self, seed: int) -> None:
         starts.start_quan(self.network, seed)
+        for guide in self.guides.parameters():
+            nn.init.zeros_(guide)
 
     def outcome(self, batch: Batch, perceptual: nn.Module | None) -> Outcome:
         rainy, clean, drops = (part[:, 0] for part in batch)
-        found = self.network(rainy, published=self.published_edges).float()
-        return Outcome(F.l1_loss(found, clean), found, clean, drops)
+        *insides, last = self.network.decoded(rainy, published=self.published_edges)
+        found = self.network.dec1_0(last).float()
+        loss = F.l1_loss(found, clean) + self.added.quan_squares * F.mse_loss(found, clean)
+        if self.added.quan_guides > 0:
+            wanted = torch.cat([clean - rainy, drops], 1)
+            loss = loss + self.added.quan_guides * self._guided(insides, wanted)
+        return Outcome(loss, found, clean, drops)
+
+    def _guided(self, insides: Sequence[Tensor], wanted: Tensor) -> Tensor:
+        total = wanted.new_zeros(())
+        for guide, inside in zip(self.guides, insides, strict=True):
+            read = guide(inside).float()
+            target = F.adaptive_avg_pool2d(wanted, read.shape[-2:])
+            total = total + F.mse_loss(read, target)
+        return total
 
     def carry(self, batch: Batch) -> Tensor:
         return self.outcome(batch._replace(clean=batch.rainy), None).loss
@@ -100,9 +137,9 @@ class WenRecipe(nn.Module):
 
     multiple, clips = wen.MULTIPLE, True
 
-    def __init__(self) -> None:
+    def __init__(self, added: Added) -> None:
         super().__init__()
-        self.network = WenNet()
+        self.network, self.added = WenNet(), added
 
     def begin(self, seed: int) -> None:
         starts.start_wen(self.network, seed)
@@ -111,6 +148,9 @@ class WenRecipe(nn.Module):
         rainy, clean = batch.rainy * 2 - 1, batch.clean * 2 - 1
         found = Frames(*(part.float() for part in self.network(rainy)))
         loss = wen_loss(found, rainy, clean, batch.drops, perceptual)
+        if self.added.wen_mended > 0:
+            mended = mend(rainy, found)
+            loss = loss + self.added.wen_mended * F.mse_loss(mended, clean)
         return Outcome(loss, found.full.flatten(1, 2), clean.flatten(1, 2), batch.drops[:, 0])
 
     def carry(self, batch: Batch) -> Tensor:
@@ -120,7 +160,9 @@ class WenRecipe(nn.Module):
         return 25 * F.mse_loss(self.network.upsample_block(x).float(), frames)
 
     def restored(self, rainy: Tensor) -> Tensor:
-        full = self.network(rainy * 2 - 1).full
+        frames = rainy * 2 - 1
+        found = self.network(frames)
+        full = mend(frames, found) if self.added.wen_mended > 0 else found.full
         return (full[:, full.shape[1] // 2] + 1) / 2
 
 
@@ -129,7 +171,7 @@ AnyRecipe = AttganRecipe | QuanRecipe | WenRecipe
 
 def recipe_of(
     method: str, seed: int, *, attention: nn.Module | None, map_loss: MapLoss,
-    train_attention: bool, steps: int, published_edges: bool,
+    train_attention: bool, steps: int, published_edges: bool, added: Added = Added(),
 ) -> AnyRecipe:  # fmt: skip
     """The recipe of `attgan`, `quan` or `wen` with its starting weights; attgan needs `attention`."""
     recipe: AnyRecipe
@@ -137,7 +179,8 @@ def recipe_of(
         assert attention is not None
         recipe = AttganRecipe(attention, map_loss, train_attention=train_attention, steps=steps)
     else:
-        recipe = QuanRecipe(published_edges=published_edges) if method == "quan" else WenRecipe()
+        quan = QuanRecipe(added, published_edges=published_edges)
+        recipe = quan if method == "quan" else WenRecipe(added)
     recipe.begin(seed)
     return recipe
 
@@ -168,4 +211,5 @@ def check_crop(recipe: AnyRecipe, crop: int, adversarial: bool) -> None:
 
 def weights_of(recipe: nn.Module) -> Mapping[str, Tensor]:
     """The networks' tensors under their published names, as `restore` loads them."""
-    return {name.split(".", 1)[1]: value for name, value in recipe.state_dict().items()}
+    parts = [name.split(".", 1) for name in recipe.state_dict()]
+    return {name: recipe.state_dict()[f"{part}.{name}"] for part, name in parts if part != "guides"}

@@ -23,6 +23,15 @@ class Frames(NamedTuple):
     clear: Tensor
 
 
+def mend(frames: Tensor, found: Frames) -> Tensor:
+    """The frames (B,T,3,H,W) where the map says that they are clear, and what was found elsewhere.
+
+    The picture that the released training compares once more for single photos, there with the true
+    map; the released program gives out `full` as it is.
+    """
+    return frames * found.clear + found.full * (1 - found.clear)
+
+
 class _Wrapped(nn.Module):
     """A convolution under the name `conv`, as the released state dict has it."""
 

@@ -56,6 +56,22 @@ def test_quan_and_wen_keep_the_size(size: tuple[int, int]) -> None:
     assert clean_wen(WenNet().eval(), frames, 1).shape == image.shape
 
 
+def test_what_wens_map_calls_clear_stays_the_photo() -> None:
+    """The map is one number here: the mean of photo and network at one half, the photo at one."""
+    network, frames = WenNet().eval(), [photo(24, 32, seed) for seed in range(3)]
+    last = network.mask_branch[3]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(0)
+        plain = clean_wen(network, frames, 1)
+        half = clean_wen(network, frames, 1, keep_clear=True)
+        last.bias.fill_(50)
+        clear = clean_wen(network, frames, 1, keep_clear=True)
+    assert np.allclose(half, (plain + frames[1]) / 2, atol=1e-5)
+    assert np.allclose(clear, frames[1], atol=1e-5)
+    assert np.array_equal(clean_wen(network, frames, 1), plain)
+
+
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     images = tmp_path / "artifacts/glass/images"
@@ -74,7 +90,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run_stage(root: Path, weights: str, method: str = "attgan") -> int:
     (root / "p").write_text(
         f"scenes: {{glass: {{}}}}\n"
-        f'restore: {{method: {method}, weights: "{weights}", published_edges: true}}\n'
+        f'restore: {{method: {method}, weights: "{weights}", published_edges: true, keep_clear: true}}\n'
     )
     with pytest.raises(SystemExit) as stop:
         restore.run("restore", restore.Params, restore.main)

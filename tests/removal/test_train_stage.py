@@ -14,6 +14,7 @@ from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.attention.weights import save_network
 from pipeline.io.images import write_image
 from pipeline.io.tensors import load_tensors
+from pipeline.removal.recipes import Added
 from pipeline.removal.training import Phase, Plan
 from pipeline.stage import Job
 from stages import restore, train_remover
@@ -39,6 +40,7 @@ PARAMS = Params(
     attention_steps=1,
     published_edges=True,
     single_share=0.1,
+    added=Added(),
     attgan=PLAN,
     quan=PLAN,
     wen=PLAN,
