@@ -120,7 +120,7 @@ def build(name: str, seed: int) -> Place:
     Same name and seed, same arrays. Raises UserError if there is no place of that name.
     """
     if name not in _PLACES:
-        raise UserError(f"no place is called {name!r}", hint=f"use one of {', '.join(NAMES)}")
+        raise UserError(f"no place is called {name!r}", hint=f"Use one of {', '.join(NAMES)}.")
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # how cv2.resize rounds depends on the number of threads

@@ -357,7 +357,7 @@ def sample_drops(
     raise UserError(
         f"drops of radius {radius_range[0]:.4g}-{radius_range[1]:.4g} m cover only "
         f"{covered:.3f} of the pane, not {coverage:.3f}",
-        hint="lower the coverage or use smaller drops",
+        hint="Lower synthesize.coverage, or the smaller of synthesize.radius_mm.",
     )
 
 
