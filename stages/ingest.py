@@ -11,7 +11,7 @@ from pydantic import Field
 
 from pipeline.io import intake
 from pipeline.io.atomic import publish_dir, write_text
-from pipeline.io.capture import Capture, adopt, find_capture
+from pipeline.io.capture import Capture, adopt, find_capture, refuse_outside
 from pipeline.io.frames import save_frames
 from pipeline.io.paths import ScenePaths
 from pipeline.io.photos import convert, examine, final_size, plan_sizes
@@ -48,6 +48,7 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Brings `data/<scene>/` into `artifacts/<scene>/images/`."""
     capture = find_capture(job.paths.data, params.min_images, read_colmap)
+    refuse_outside(job.paths.data, capture)
     with publish_dir(job.paths.images) as fresh:
         if capture.video is not None:
             fewest, longest = params.min_images, params.max_size

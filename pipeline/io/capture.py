@@ -182,13 +182,8 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
     if not source.is_dir():
         raise UserError(f"{source} is no folder and no video.", "Name the folder of your photos.")
     capture = find_capture(source, at_least, read_colmap)
+    refuse_outside(source, capture)
     files = _belonging(source, capture)
-    outside = [path for path in files if not Path(os.path.normpath(path)).is_relative_to(source)]
-    if outside:
-        raise UserError(
-            f"{source / TRANSFORMS} names {outside[0]}, which lies outside of {source}.",
-            "Copy the capture into one folder first.",
-        )
     with publish_dir(data) as fresh:
         for path in files:
             target = fresh / path.relative_to(source)
@@ -196,6 +191,20 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
             shutil.copyfile(path, target)
         if (source / TRUTH).is_dir():
             shutil.copytree(source / TRUTH, fresh / TRUTH)
+
+
+def refuse_outside(folder: Path, capture: Capture) -> None:
+    """UserError for a photo or mask that transforms.json names outside of its folder.
+
+    It would be missing in a copy of the folder, and a change of it would go unnoticed.
+    """
+    inside = Path(os.path.normpath(folder))
+    for path in (*capture.photos.values(), *capture.masks.values()):
+        if not Path(os.path.normpath(path)).is_relative_to(inside):
+            raise UserError(
+                f"{folder / TRANSFORMS} names {path}, which lies outside of {folder}.",
+                "Copy all photos into one folder with it, and name them relative to it.",
+            )
 
 
 def _belonging(source: Path, capture: Capture) -> list[Path]:

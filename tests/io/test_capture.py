@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import UserError
-from pipeline.io.capture import Capture, adopt, find_capture
+from pipeline.io.capture import Capture, adopt, find_capture, refuse_outside
 from pipeline.io.given import (
     GivenView,
     Straightener,
@@ -263,6 +263,22 @@ def test_adopting_copies_what_belongs_and_nothing_else(tmp_path: Path) -> None:
     assert _find(data).posed_by == "nerfstudio"
     with pytest.raises(UserError, match="exists already"):
         adopt(source, data, 3, _no_colmap)
+
+
+@pytest.mark.parametrize("kind", ["../elsewhere/", "/absolute/"])
+def test_photos_outside_of_the_folder_are_refused(tmp_path: Path, kind: str) -> None:
+    source = tmp_path / "capture"
+    _photos(tmp_path / "elsewhere")
+    there = kind if kind.startswith("..") else f"{tmp_path}/elsewhere/"
+    content = _transforms(source)
+    for frame in content["frames"]:
+        frame["file_path"] = there + Path(frame["file_path"]).name
+    _write(source, content)
+    with pytest.raises(UserError, match=r"transforms\.json names .*a\.jpg, which lies outside"):
+        refuse_outside(source, _find(source))
+    _photos(source / "images")
+    _write(source, _transforms(source))
+    refuse_outside(source, _find(source))
 
 
 def test_adopting_what_cannot_be_used_leaves_nothing(tmp_path: Path) -> None:
