@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import disk_fault, disk_faults
-from pipeline.io.paths import ScenePaths
+from pipeline.io.paths import SHARED, ScenePaths
 from pipeline.params import Section, read_folders, read_section
 
 __all__ = ["Job", "Section", "run"]
@@ -135,6 +135,13 @@ def _run(
 ) -> int:
     params = read_section(params_file, name, params_type, flags.scene, flags.variant)
     folders = read_folders(params_file, flags.variant)
+    makes = "images" if name == "ingest" else name
+    if flags.variant is not None and makes in SHARED and makes not in folders:
+        raise UserError(
+            f"--variant {flags.variant} shares {makes}/ with its scene; it would be overwritten.",
+            "Leave --variant away, or give the variant a folder of its own: "
+            f"variants.{flags.variant}.folders.{makes}.",
+        )
     job = Job(
         params_file.parent,
         flags.scene,

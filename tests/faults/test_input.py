@@ -167,6 +167,13 @@ def test_an_unknown_variant(photos: Workshop) -> None:
     photos.refuses("nerf", "unmaskd", "Did you mean unmasked?", flags=("--variant", "unmaskd"))
 
 
+@pytest.mark.parametrize("stage", ["ingest", "masks", "refine"])
+def test_a_variant_does_not_overwrite_what_it_shares(photos: Workshop, stage: str) -> None:
+    folder = "images" if stage == "ingest" else stage
+    told = (f"--variant unmasked shares {folder}/ with its scene", f"folders.{folder}")
+    photos.refuses(stage, *told, flags=("--variant", "unmasked"))
+
+
 def test_cuda_where_there_is_none(whole: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     whole.refuses("nerf", "no usable CUDA device", "--device auto", flags=("--device", "cuda"))
