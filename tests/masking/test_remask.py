@@ -104,6 +104,22 @@ def test_the_exposure_is_matched_and_the_rest_is_residual() -> None:
     assert np.nanmax(found) <= 0.3 + 1e-6
 
 
+def test_grain_is_blurred_before_its_absolute_value_in_proportion_to_the_picture() -> None:
+    grain = np.float32(0.1) * (1 - 2 * (np.indices((60, 1000)).sum(axis=0) % 2))
+    photo = np.full((60, 1000, 3), 0.5, np.float32)
+    render = photo + grain[..., None]
+    nowhere = np.zeros(grain.shape, bool)  # kept: the exposure is taken as it is
+
+    def left(width: int) -> float:
+        part = render[:, :width], photo[:, :width], nowhere[:, :width], ~nowhere[:, :width]
+        return float(residual(*part)[5:-5, 5:-5].mean())
+
+    # A chequerboard falls by exp(-pi^2 sigma^2), sigma 2 px at 1000 pixels, 0.2 at 100.
+    assert left(1000) < 1e-3
+    assert left(400) == pytest.approx(0.1 * np.exp(-(np.pi**2) * 0.8**2), abs=2e-3)
+    assert left(100) > 0.06
+
+
 def _drop_scene() -> tuple[list[np.ndarray | None], np.ndarray]:
     """Residuals of six views with one drop on the lens; each view has a false blob elsewhere."""
     rng = np.random.default_rng(3)
