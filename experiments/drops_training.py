@@ -2,13 +2,16 @@
 
 `python -m experiments.drops_training OUT --seeds 100 110 --views 8` writes
 OUT/{rainy,coverage,clean}/NNN.png. Even seeds are streets, odd ones rooms. Every view has a drop
-pattern, a pane and an aperture of its own, unless --shared fixes one pattern to the lens per seed.
+pattern, a pane and an aperture of its own, unless --shared fixes one pattern to the lens per seed. With
+--arm, every second pane stays in the scene at arm's length, seen aslant, and half of all panes hold
+flat drops.
 Seeds below 100 are left to the scenes that detectors are judged on.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +53,26 @@ def random_pane(
             continue
 
 
-def make(out: Path, seeds: range, views: int, spp: int, shared: bool) -> None:
+def arm_pane(rng: np.random.Generator) -> tuple[mitsuba_scene.Camera, None, list[Drop]]:
+    """A camera and the drops of a pane that stays in the scene, synthesis.SCENE_PANE_M away."""
+    focal = synthesis.focal_px(WIDTH, float(rng.uniform(45, 70)))
+    camera = mitsuba_scene.Camera(
+        WIDTH, HEIGHT, focal, float(rng.choice([0.0, 0.001, 0.003, 0.006]))
+    )
+    small = float(rng.uniform(4, 9))
+    radii = (small, small * float(rng.uniform(1.5, 4.5)))
+    return camera, None, synthesis.scene_drops(rng, camera, float(rng.uniform(0.06, 0.25)), radii)
+
+
+def flattened(rng: np.random.Generator, drops: list[Drop]) -> list[Drop]:
+    """The drops, in half of the cases all with smaller contact angles, as on clean glass."""
+    if rng.random() < 0.5:
+        return drops
+    factor = float(rng.uniform(0.25, 0.8))
+    return [replace(drop, contact_angle=drop.contact_angle * factor) for drop in drops]
+
+
+def make(out: Path, seeds: range, views: int, spp: int, shared: bool, arm: bool) -> None:
     """Renders the pairs that `out` does not hold yet."""
     for folder in ("rainy", "coverage", "clean"):
         (out / folder).mkdir(parents=True, exist_ok=True)
@@ -65,7 +87,12 @@ def make(out: Path, seeds: range, views: int, spp: int, shared: bool) -> None:
         pane = random_pane(rng, light=True)
         exposure = synthesis.place_exposure(baked, pane[0])
         for k, name in enumerate(names):
+            pane_m: float | None
             camera, pane_m, drops = pane if shared else random_pane(rng, light=False)
+            if arm:
+                if k % 2:
+                    camera, pane_m, drops = arm_pane(rng)
+                drops = flattened(rng, drops)
             view = synthesis.wet_view(
                 baked, camera, poses[k], drops, exposure=exposure * float(rng.uniform(0.7, 1.3)),
                 spp=spp, clean_spp=spp, seed=seed * 1009 + k, pane_m=pane_m,
@@ -83,8 +110,11 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--spp", type=int, default=32)
     parser.add_argument("--shared", action="store_true", help="one drop pattern per place")
+    parser.add_argument(
+        "--arm", action="store_true", help="panes in the scene, and flat drops, too"
+    )
     flags = parser.parse_args()
-    make(flags.out, range(*flags.seeds), flags.views, flags.spp, flags.shared)
+    make(flags.out, range(*flags.seeds), flags.views, flags.spp, flags.shared, flags.arm)
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ class Params(Section):
     seed: Annotated[int, Field(ge=0)]
     photos: str
     painted: Annotated[int, Field(ge=pools.CHUNK, multiple_of=pools.CHUNK)]
+    veils: Annotated[int, Field(ge=0, multiple_of=pools.CHUNK)]
     rendered: list[str]
     photo_pairs: list[str]
     shares: tuple[float, float, float]
@@ -89,29 +90,28 @@ def main(job: Job, params: Params) -> str:
     return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"
 
 
-def _painted(job: Job, folder: str, seed: int, count: int) -> pools.Pictures:
+def _painted(job: Job, folder: str, seed: int, count: int, veils: bool = False) -> pools.Pictures:
     """Painted pictures on the photos of a folder and on procedural ones, made where missing."""
     photos = pools.list_pictures(job.resolve(folder)) if folder else ()
-    work = ScenePaths(job.root, job.scene).work("train_detector") / pools.painted_name(seed, photos)
-    chunks = {f"{k:04d}": (work / f"{k:04d}.npy", seed, k, photos)
-              for k in range(-(-count // pools.CHUNK))}  # fmt: skip
+    work = ScenePaths(job.root, job.scene).work("train_detector")  # the same for all variants
+    chunks = pools.painted_chunks(work, seed, count, photos, veils)
     map_named(pools.paint_chunk, chunks, job_label="painting")
     return pools.together([pools.read_chunk(chunk[0]) for chunk in chunks.values()], count)
 
 
 def _training(job: Job, params: Params) -> list[Pool]:
-    sources = (
-        _painted(job, params.photos, params.seed, params.painted),
-        pools.together([pools.read_rendered(job.resolve(path)) for path in params.rendered]),
-        pools.together([pools.read_photo_pairs(job.resolve(path)) for path in params.photo_pairs]),
-    )
+    painted = [_painted(job, params.photos, params.seed, params.painted),
+               _painted(job, params.photos, params.seed, params.veils, veils=True)]  # fmt: skip
+    rendered = [pools.read_rendered(job.resolve(path)) for path in params.rendered]
+    pairs = [pools.read_photo_pairs(job.resolve(path)) for path in params.photo_pairs]
+    sources = [pools.together(parts) for parts in (painted, rendered, pairs)]
     return pools.weighted(sources, params.shares)
 
 
 def _validation(job: Job, params: Params) -> dict[str, Pool]:
     """Pictures of other seeds, photos and places than those that are trained on."""
     painted = _painted(job, params.validation_photos, params.seed + 1, params.validation)
-    folders = [job.resolve(path) for path in params.validation_rendered]
+    folders = map(job.resolve, params.validation_rendered)
     rendered = {path.name: Pool(*pools.read_rendered(path)) for path in folders}
     return {**rendered, "painted": Pool(*painted)}
 

@@ -24,26 +24,37 @@ KINDS = ("rainy", "clean", "coverage")
 Pictures = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]
 
 
-def paint_chunk(path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = ()) -> None:
+def paint_chunk(
+    path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = (), veils: bool = False
+) -> None:
     """Writes a hundred painted pictures, each from a generator of its own, unless they exist.
 
     photos: clean photographs; PHOTO_SHARE of the backgrounds are crops of them, the others are
-    procedural. One array (100,256,256,7) uint8: rainy, clean, coverage.
+    procedural. veils: see pairs.sample_shots. One array (100,256,256,7) uint8: rainy, clean, coverage.
     """
     if path.is_file():
         return
     pictures = np.empty((CHUNK, SIZE, SIZE, 7), np.uint8)
     for k in range(CHUNK):
         rng = np.random.default_rng([seed, chunk, k])
-        shots = sample_shots(rng, background(rng, photos))
+        shots = sample_shots(rng, background(rng, photos), veils=veils)
         stacked = np.dstack(shots)
         pictures[k] = as_bytes(stacked)
     write_npy(path, pictures)
 
 
-def painted_name(seed: int, photos: Sequence[Path]) -> str:
+def painted_name(seed: int, photos: Sequence[Path], veils: bool = False) -> str:
     """A name for pictures painted from this seed and these photos, whatever folder they lie in."""
-    return stills.painted_name("painted", seed, photos)
+    return stills.painted_name("veils" if veils else "painted", seed, photos)
+
+
+def painted_chunks(
+    work: Path, seed: int, count: int, photos: tuple[Path, ...], veils: bool = False
+) -> dict[str, tuple[Path, int, int, tuple[Path, ...], bool]]:
+    """What `paint_chunk` needs for the first `count` pictures, below `work`, by the chunk's name."""
+    folder = work / painted_name(seed, photos, veils)
+    names = [f"{k:04d}" for k in range(-(-count // CHUNK))]
+    return {name: (folder / f"{name}.npy", seed, int(name), photos, veils) for name in names}
 
 
 def background(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:

@@ -28,18 +28,23 @@ def sample_pair(
 
 
 def sample_shots(
-    rng: np.random.Generator, background: Image, *, clean_share: float = CLEAN_SHARE
+    rng: np.random.Generator,
+    background: Image,
+    *,
+    clean_share: float = CLEAN_SHARE,
+    veils: bool = False,
 ) -> tuple[Image, Image, NDArray[np.float32]]:
     """The pair of `sample_pair` with, in its middle, the same photo without the drops.
 
     Both photos are taken through the same pane by the same camera with the same noise, so that
-    they differ where the water shows and nowhere else (but for what compression does).
+    they differ where the water shows and nowhere else (but for what compression does). veils: the
+    water is wide and flat, or blurred to faint discs.
     """
     height, width = background.shape[:2]
     dry = through_glass(rng, background)
     wet, coverage = dry, np.zeros((height, width), np.float32)
     if rng.random() >= clean_share:
-        wet, coverage = _wet(rng, dry)
+        wet, coverage = (_veiled if veils else _wet)(rng, dry)
     clean = through_camera(copy.deepcopy(rng), dry)
     return through_camera(rng, wet), clean, coverage
 
@@ -84,6 +89,39 @@ def _wet(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.floa
         highlight=float(rng.uniform(0.0, 5.0)),
         # Most drops gather light from above the photo: before dark things they look white.
         sky_gain=float(np.exp(rng.uniform(np.log(0.7), np.log(6.0)))),
+        rim_light=float(rng.uniform(0.15, 0.7)),
+        surroundings=_surroundings(rng),
+    )
+
+
+def _veiled(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.float32]]:
+    """Wide flat water or faint blurred discs: what drops look like on clean glass, or very close."""
+    side = max(image.shape[:2])
+    largest = float(side * np.exp(rng.uniform(np.log(0.05), np.log(0.3))))
+    # Sharp or soft outlines of films, or discs of confusion wider than the water that makes them.
+    films = rng.random() < 0.5
+    blur = float(rng.uniform(0.0, 0.8 if films else 3.0) * largest)
+    blur = min(blur, 60.0)
+    largest = max(largest, 0.4 * blur)
+    smallest = max(largest * float(rng.uniform(0.15, 0.7)), 0.2 * blur, 0.8)
+    focal = max(float(side * np.exp(rng.uniform(np.log(0.7), np.log(4.0)))), 6.0 * largest)
+    drops = scatter(
+        rng,
+        image.shape[:2],
+        float(np.exp(rng.uniform(np.log(0.05), np.log(0.5)))),
+        (smallest, max(largest, 1.3 * smallest)),
+        size_exponent=float(rng.uniform(0.5, 2.0)),
+        contact_angle_range=(np.radians(4), np.radians(22 if films else 50)),
+        margin=0.5 * blur,
+    )
+    return paint(
+        image,
+        drops,
+        focal_px=focal,
+        pane_distance=focal,
+        aperture_radius=blur / 2,
+        highlight=float(rng.uniform(0.0, 3.0)),
+        sky_gain=float(np.exp(rng.uniform(np.log(0.5), np.log(3.0)))),
         rim_light=float(rng.uniform(0.15, 0.7)),
         surroundings=_surroundings(rng),
     )

@@ -24,6 +24,7 @@ PARAMS = Params(
     seed=5,
     photos="photos",
     painted=100,
+    veils=100,
     rendered=["rendered"],
     photo_pairs=["pairs"],
     shares=(0.5, 0.5, 0.5),
@@ -103,6 +104,7 @@ def test_weights_and_curve_and_the_same_after_an_interruption(
 
 def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:
     photos = pools.list_pictures(root / "photos")
+    assert pools.painted_name(5, photos) != pools.painted_name(5, photos, veils=True)
     chunk = root / "0.npy"
     pools.paint_chunk(chunk, 5, 0, photos)
     written = chunk.read_bytes()
@@ -114,3 +116,6 @@ def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:
         np.abs(a.astype(int) - b)[c == 0] for a, b, c in zip(rainy, clean, coverage, strict=True)
     ]
     assert np.mean(np.concatenate(dry)) < 3  # compression alone tells them apart there
+    veiled = root / "1.npy"
+    pools.paint_chunk(veiled, 5, 0, photos, veils=True)
+    assert not np.array_equal(np.load(veiled)[..., 6], np.load(chunk)[..., 6])

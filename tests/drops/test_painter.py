@@ -16,7 +16,7 @@ from pipeline.drops.optics import (
     srgb_to_linear,
 )
 from pipeline.drops.painter import paint, scatter
-from pipeline.drops.pairs import sample_pair
+from pipeline.drops.pairs import sample_pair, sample_shots
 from pipeline.drops.shape import Drop, coverage_raster
 
 
@@ -139,6 +139,16 @@ def test_pairs_are_repeatable_and_sometimes_dry() -> None:
         assert rainy.shape == (64, 64, 3) and coverage.shape == (64, 64)
         assert rainy.min() >= 0 and rainy.max() <= 1
         assert coverage.min() >= 0 and coverage.max() <= 1
+
+
+def test_veils_are_fainter_than_drops() -> None:
+    background = sample_background(np.random.default_rng(4), 96)
+    changes = []
+    for veils in (False, True):
+        rngs = [np.random.default_rng([0, k]) for k in range(12)]
+        shots = [sample_shots(rng, background, clean_share=0, veils=veils) for rng in rngs]
+        changes.append(np.concatenate([np.abs(wet - dry)[c > 0.05] for wet, dry, c in shots]))
+    assert 0.01 < changes[1].mean() < 0.7 * changes[0].mean()
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS), key=lambda f: f.__name__))
