@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -144,6 +145,41 @@ def test_what_stays_on_the_lens_is_a_drop_and_what_does_not_is_given_back() -> N
     assert all(np.array_equal(mask, drop) for mask in found.drop_masks)
     assert found.known == 1.0
     assert changed_share(old, found.drop_masks) == pytest.approx((120 + 64) / 2000)
+
+
+class _CoarseGlass:
+    """Cells of 4x4 pixels."""
+
+    shape = (16, 16)
+
+    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        return cv2.resize(values.astype(np.float32), self.shape, interpolation=cv2.INTER_AREA)
+
+    def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
+        return cv2.resize(values.astype(np.float32), (64, 64), interpolation=cv2.INTER_LINEAR)
+
+
+def test_rims_run_between_cells() -> None:
+    apart = np.hypot(*(np.indices((64, 64)) - 31.5))
+    residuals = [
+        np.float32(0.01) * 10 ** np.clip(0.5 + (18 - apart) / 12, 0, 1).astype(np.float32)
+    ] * 3
+    old = [np.zeros((64, 64), bool)] * 3
+
+    def roundness(drop_mask: np.ndarray) -> float:
+        discs = [apart < radius for radius in np.arange(14, 24, 0.25)]
+        return max((disc & drop_mask).sum() / (disc | drop_mask).sum() for disc in discs)
+
+    glass = _CoarseGlass()
+    found = redraw_views(glass, residuals, old, quantile=0.5)
+    assert roundness(found.drop_masks[0]) > 0.97
+    cells = redraw(
+        glass.from_view(0, residuals[0]), np.full((16, 16), 3), np.zeros((16, 16), bool), 1,
+        reach=3.2, join=0.5,
+    )  # fmt: skip
+    assert np.array_equal(cells.margin > 0, cells.drop_mask)
+    blocks = np.kron(cells.drop_mask, np.ones((4, 4), bool))
+    assert roundness(blocks) < 0.96
 
 
 def test_a_window_follows_a_creeping_drop() -> None:
