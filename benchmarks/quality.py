@@ -6,7 +6,8 @@
 A scene is a folder with photos and `truth/` (`clean/`, `coverage/`, `cameras.json`, perhaps
 `depth/`), as `synthesize` makes it. Estimated poses and the masks of the stages `masks` and
 `refine` are read from `artifacts/<scene>/` where they exist. Every eighth view is held out and
-compared with its clean reference; settings are those of params.yaml. *seen*: the pixels whose
+compared with its clean reference; settings are those of params.yaml. *clean-masked*: the clean photos
+behind the true masks, without the rainy photos' own noise and blur between the drops. *seen*: the pixels whose
 surface at least three fitted photos show without a drop, by the depth of the clean fit; the oracle
 gap is the loss against the clean photos with the same poses.
 """
@@ -41,6 +42,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TRUE_COVERAGE = 0.02
 ROWS = {
     "clean": ("clean", "none", "true"),
+    "clean-masked": ("clean", "true", "true"),
     "none": ("rainy", "none", "true"),
     "true": ("rainy", "true", "true"),
     "clean-sfm": ("clean", "none", "sfm"),
@@ -221,7 +223,7 @@ def main() -> None:
             if poses not in scene.views or not scene.drawn.get(masks, True):
                 continue
             result = measure(scene, row, settings, flags.threads, seen)
-            if kind == "clean":
+            if kind == "clean" and masks == "none":
                 if not seen:
                     seen = seen_pixels(scene, result.renders)
                     errors = {s: (result.renders[s].rgb - scene.clean[s]) ** 2 for s in seen}
