@@ -16,6 +16,9 @@ def account(done: Repaired, names: Sequence[str]) -> dict[str, Any]:
     """The rounds of the loop for refine.json; `names` of the images whose masks they hold, in order."""
     last = done.rounds[-1]
     found = last.found
+    glass = describe(found)
+    if last.window:
+        glass += f", over {last.window} neighbouring photos at a time"
     pane = None
     if found.mode == "pane" and found.pane_from_world is not None:
         pane = {
@@ -26,7 +29,7 @@ def account(done: Repaired, names: Sequence[str]) -> dict[str, Any]:
         }
     return {
         "mode": found.mode,
-        "why": f"{describe(found)}; {done.ended}",
+        "why": f"{glass}; {done.ended}",
         "pane": pane,
         "rounds": {str(number): _round(one) for number, one in enumerate(done.rounds)},
         "coverage": {

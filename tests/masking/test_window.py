@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.masking.account import account
 from pipeline.masking.glass import GlassCamera
 from pipeline.masking.loop import repair
 from pipeline.masking.window import alike_by_distance, chosen_window
@@ -87,6 +88,9 @@ def test_the_loop_goes_by_the_window_that_it_chose() -> None:
         done = repair(look, maps, cameras, drawn, 5.0, rounds=1, mode="lens", window=window)  # type: ignore[arg-type]
         masks = done.rounds[0].drop_masks
         assert done.rounds[0].window == (3 if window == "auto" else window)
+        told = account(done, [str(view) for view in range(COUNT)])
+        assert ("over 3 neighbouring photos" in told["why"]) == (window == "auto")
+        assert told["rounds"]["0"]["window"] == done.rounds[0].window
         pairs = list(zip(masks, truth, strict=True))
         return sum((a & b).sum() for a, b in pairs) / sum((a | b).sum() for a, b in pairs)
 
