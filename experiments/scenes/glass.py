@@ -8,7 +8,8 @@ and from another.
 
 from __future__ import annotations
 
-import sys
+import argparse
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from pipeline.drops.creep import crept
 from pipeline.drops.pane import paint_pane
 from pipeline.drops.shape import Drop
 from pipeline.drops.stains import NAMES
+from pipeline.io.images import as_bytes
 
 SIZE = (200, 150)
 SEED = 7
@@ -66,7 +68,7 @@ class Street:
         )  # fmt: skip
         both, either = np.minimum(alpha, view.alpha).sum(), np.maximum(alpha, view.alpha).sum()
         print(f"painted against rendered coverage: IoU {both / either:.3f}", flush=True)
-        return synthesis.to_bytes(rainy)
+        return as_bytes(rainy)
 
 
 def ahead(distance: float) -> np.ndarray:
@@ -103,10 +105,13 @@ def panels() -> list[np.ndarray]:
 
 def main() -> None:
     """Writes the sheet."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    out = parser.parse_args().out
     parts = panels()
     rows = [np.hstack(parts[k : k + 4]) for k in range(0, len(parts), 4)]
     sheet = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
-    cv2.imwrite(sys.argv[1], sheet, [cv2.IMWRITE_JPEG_QUALITY, 78])
+    cv2.imwrite(str(out), sheet, [cv2.IMWRITE_JPEG_QUALITY, 78])
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ pairs per CPU second, and its posed views of 400x300.
 
 from __future__ import annotations
 
+import argparse
 import os
-import sys
 import time
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +22,7 @@ from pipeline.drops import mitsuba_scene, places, storing, synthesis
 from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import sample_pair
 from pipeline.drops.pane import paint_pane
+from pipeline.io.images import as_bytes
 
 PARAMS = Path(__file__).with_name("params.yaml")
 
@@ -62,7 +63,7 @@ def scene_numbers(name: str, recipe: storing.Recipe) -> str:
     view_processor = (time.process_time() - processor) / 2
     spp = 4 * recipe["clean_spp"]
     better = mitsuba_scene.render(baked, camera, poses[1], spp=spp, seed=99).radiance
-    level = psnr(view.clean, synthesis.to_bytes(mitsuba_scene.develop(better, exposure)))
+    level = psnr(view.clean, as_bytes(mitsuba_scene.develop(better, exposure)))
     water = float((view.alpha > 0.5).mean())
     total = bake_clock + recipe["views"] * view_clock
     return (
@@ -102,7 +103,10 @@ def posed_views_per_second(count: int = 6) -> float:
 
 def main() -> None:
     """Prints the tables."""
-    chosen = sys.argv[1:] or ["street", "street-move", "room", "harbour", "harbour-move"]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="*", metavar="SCENE")
+    chosen = parser.parse_args().scenes
+    chosen = chosen or ["street", "street-move", "room", "harbour", "harbour-move"]
     print(f"on {len(os.sched_getaffinity(0))} cores; in brackets seconds of the processor")
     print(
         "| scene | light, s | one view, s | all views, s | 64 against 256 spp, dB | drops | water |"

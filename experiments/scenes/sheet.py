@@ -5,7 +5,7 @@ Above three wet views, below the middle one's clean reference, coverage and dept
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import cv2
@@ -31,4 +31,8 @@ def sheet(data: Path, width: int = 300) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    cv2.imwrite(sys.argv[2], sheet(Path(sys.argv[1])), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path, help="a scene's folder, with its truth")
+    parser.add_argument("out", type=Path)
+    flags = parser.parse_args()
+    cv2.imwrite(str(flags.out), sheet(flags.data), [cv2.IMWRITE_JPEG_QUALITY, 85])
