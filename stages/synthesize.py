@@ -55,7 +55,7 @@ class Params(Section):
 def _rendered(job: Job, params: Params, work: Path) -> None:
     """Renders the views that `work` does not hold yet, and writes the true cameras."""
     recipe = params.model_dump(mode="json")
-    stems = {f"view_{k:02d}": k for k in range(params.views)}
+    stems = storing.stems(params.views)
     camera, poses, _ = storing.plan(recipe)
     todo = {
         stem: (recipe, k, stem, work)

@@ -33,6 +33,12 @@ def encode(path: Path, image: np.ndarray, quality: int | None = None) -> None:
     write_bytes(path, data.tobytes())
 
 
+def stems(count: int) -> dict[str, int]:
+    """The names of `count` views and their numbers; the order of the names is that of the views."""
+    digits = max(2, len(str(count - 1)))
+    return {f"view_{number:0{digits}d}": number for number in range(count)}
+
+
 def plan(recipe: Recipe) -> tuple[mitsuba_scene.Camera, list[synthesis.Matrix], list[Drop]]:
     """Camera, poses (cam_from_world) and drops of a rendered scene."""
     optics = ("width", "height", "field_of_view_deg", "aperture_mm")

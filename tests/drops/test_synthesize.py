@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.drops import bake as baking
 from pipeline.drops import mitsuba_scene as ms
-from pipeline.drops import pane, places, synthesis
+from pipeline.drops import pane, places, storing, synthesis
 from pipeline.drops.places_parts import Builder
 from pipeline.drops.shape import Drop
 from pipeline.errors import UserError
@@ -36,6 +36,13 @@ def wall() -> places.Place:
     sky = np.full((16, 32, 3), 0.5, np.float32)
     down = np.array([0, 1, 0], np.float32)
     return places.Place("wall", 1, b.meshes(), sky, down, np.zeros(3, np.float32), [])
+
+
+@pytest.mark.parametrize(("count", "last"), [(1, "view_00"), (100, "view_99"), (101, "view_100")])
+def test_views_are_in_the_order_of_their_names(count: int, last: str) -> None:
+    names = storing.stems(count)
+    assert sorted(names) == list(names) and list(names.values()) == list(range(count))
+    assert max(names) == last
 
 
 @pytest.fixture(scope="module")
