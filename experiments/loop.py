@@ -55,7 +55,9 @@ def table(root: Path, scene: str) -> list[str]:
     drawn |= mask_scores(counts)._asdict() if counts else {}
     lines = [_line(scene, "masks", drawn, "")]
     for number, numbers in score_rounds(paths.refine, files, COVERED).items():
-        lines.append(_line(scene, number, numbers, about["rounds"][number]["glass"]))
+        told = about["rounds"][number]
+        window = f", over {told['window']} neighbours" if told["window"] else ""
+        lines.append(_line(scene, number, numbers, told["glass"] + window))
     return [*lines, f"| {scene} | ended: {about['why']} |"]
 
 
