@@ -69,6 +69,14 @@ def test_dvc_lists_the_parameters_that_a_stage_reads(name: str) -> None:
     assert set(entry["params"]) == expected
 
 
+def test_a_stage_says_in_one_sentence_what_it_does() -> None:
+    """`--help` shows it."""
+    for path, text in _sources().items():
+        if path.startswith("stages/") and not path.endswith("__init__.py"):
+            told = ast.get_docstring(ast.parse(text)) or ""
+            assert told.endswith(".") and "\n" not in told and len(told) > 30, path
+
+
 def test_a_scenes_page_needs_every_stage_of_it_and_of_its_comparison() -> None:
     """`make demo` asks DVC for the page alone: it must bring everything else along.
 
