@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from pydantic import Field
@@ -48,8 +48,6 @@ def main(job: Job, params: Params) -> str:
     )
     account = gather.optional_json(paths.poses / "poses.json")
     lost = gather.lost_images(account)
-    rows = gather.image_numbers(paths.metrics_csv)
-    seen = gather.optional_json(paths.views / "seen.json")
     heat, heat_max = gather.coverage_heat(paths, records, params.picture_size, params.quality)
     film, film_missing = gather.video(paths.views / "path.mp4")
     page = Page(
@@ -58,15 +56,7 @@ def main(job: Job, params: Params) -> str:
         tiles=numbers.tiles(metrics, other),
         table=numbers.table(metrics, other),
         compared=compared,
-        photos=[
-            _photo(
-                r,
-                pictures[r.name],
-                notes.photo_notes(rows.get(r.name, {}), seen.get(r.name, {})),
-                dict(lost).get(r.name, ""),
-            )
-            for r in records
-        ],
+        photos=_photos(paths, records, pictures, dict(lost)),
         charts=charts(paths, other_paths if compared else None, records),
         coverage=heat,
         coverage_max=heat_max,
@@ -88,10 +78,22 @@ def main(job: Job, params: Params) -> str:
     return f"open {paths.report / 'index.html'}"
 
 
-def _photo(record: ImageRecord, pictures: Mapping[str, str], notes: list[str], lost: str) -> Photo:
-    ratio = record.width / record.height
-    upright = 1 / ratio if record.turned % 180 else ratio
-    return Photo(record.name, record.split == "test", pictures, notes, lost, upright)
+def _photos(
+    paths: ScenePaths,
+    records: Sequence[ImageRecord],
+    pictures: Mapping[str, Mapping[str, str]],
+    lost: Mapping[str, str],
+) -> list[Photo]:
+    rows = gather.image_numbers(paths.metrics_csv)
+    seen = gather.optional_json(paths.views / "seen.json")
+    photos = []
+    for record in records:
+        name, ratio = record.name, record.width / record.height
+        said = notes.photo_notes(rows.get(name, {}), seen.get(name, {}))
+        upright = 1 / ratio if record.turned % 180 else ratio
+        held_out = record.split == "test"
+        photos.append(Photo(name, held_out, pictures[name], said, lost.get(name, ""), upright))
+    return photos
 
 
 if __name__ == "__main__":

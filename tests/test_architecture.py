@@ -142,7 +142,6 @@ LONG_FUNCTIONS = {
     "pipeline/drops/places_street.py:build",
     "pipeline/drops/places_things.py:stall",
     "pipeline/sfm/given.py:triangulate",
-    "stages/report.py:main",
 }
 
 
