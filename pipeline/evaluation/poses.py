@@ -12,7 +12,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.summary import put
 from pipeline.geometry.poses import pose_errors
 from pipeline.io.atomic import read_json
-from pipeline.io.scene import ImageRecord
+from pipeline.io.scene import ImageRecord, image_name
 
 # Turning an image a quarter counter-clockwise turns the camera's axes with it: x' = y, y' = -x.
 _QUARTER = np.eye(4)
@@ -32,7 +32,9 @@ def read_true_cameras(
     content = read_json(path)
     try:
         frames = {
-            stem: np.asarray(frame["cam_from_world"], np.float64).reshape(4, 4)
+            image_name(Path(f"{stem}.png")): np.asarray(
+                frame["cam_from_world"], np.float64
+            ).reshape(4, 4)
             for stem, frame in content["frames"].items()
         }
         unit = str(content.get("unit", "units of the true cameras"))
@@ -41,9 +43,9 @@ def read_true_cameras(
             f"{path} is not a list of true cameras ({error!r}).", "Restore the file."
         ) from None
     cameras = {
-        record.name: np.linalg.matrix_power(_QUARTER, record.turned // 90 % 4) @ frames[record.stem]
+        record.name: np.linalg.matrix_power(_QUARTER, record.turned // 90 % 4) @ frames[record.name]
         for record in records
-        if record.stem in frames
+        if record.name in frames
     }
     return cameras, unit
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.io.images import PHOTO_SUFFIXES, image_size, read_photo, turn
-from pipeline.io.scene import ImageRecord
+from pipeline.io.scene import ImageRecord, image_name
 
 
 def find_references(folder: Path, records: Sequence[ImageRecord]) -> dict[str, Path] | None:
     """The reference file of every image, by image name; None when the folder does not exist.
 
-    A reference bears its image's name with any image suffix. UserError naming the images that have
-    none, and for an image that has two.
+    A reference bears its photo's name, or its image's, with any image suffix. UserError naming the
+    images that have none, and for an image that has two.
     """
     if not folder.is_dir():
         return None
@@ -25,11 +25,12 @@ def find_references(folder: Path, records: Sequence[ImageRecord]) -> dict[str, P
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in PHOTO_SUFFIXES:
             continue
-        if path.stem in files:
-            other = files[path.stem].name
+        name = image_name(path)
+        if name in files:
+            other = files[name].name
             raise UserError(f"{path} and {other} are references of one image.", "Keep one.")
-        files[path.stem] = path
-    missing = [record.name for record in records if record.stem not in files]
+        files[name] = path
+    missing = [record.name for record in records if record.name not in files]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         shown = ", ".join(missing[:3]) + more
@@ -37,7 +38,7 @@ def find_references(folder: Path, records: Sequence[ImageRecord]) -> dict[str, P
             f"{folder} has no reference for {shown}.",
             "A reference is named like its photo; move the folder away to go without references.",
         )
-    return {record.name: files[record.stem] for record in records}
+    return {record.name: files[record.name] for record in records}
 
 
 def read_reference(path: Path, record: ImageRecord, source: Path) -> np.ndarray:

@@ -13,7 +13,8 @@ from pipeline.io.atomic import publish_dir
 from pipeline.io.given import GivenView, read_nerfstudio
 from pipeline.io.images import PHOTO_SUFFIXES
 from pipeline.io.llff import read_poses_bounds
-from pipeline.io.photos import VIDEO_SUFFIXES, by_image_name, image_name, list_photos
+from pipeline.io.photos import VIDEO_SUFFIXES, by_image_name, list_photos
+from pipeline.io.scene import image_name
 
 TRANSFORMS = "transforms.json"
 POSES_BOUNDS = "poses_bounds.npy"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -14,12 +13,10 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.io.images import PHOTO_SUFFIXES, can_read, read_photo, resized, turn, write_image
-from pipeline.io.scene import ImageRecord
+from pipeline.io.scene import ImageRecord, image_name
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
-# `mean.exr` among the attention maps belongs to the temporal mean.
-RESERVED_STEMS = frozenset({"mean"})
 SAME_SHAPE = 1.005  # ratios of width to height this far apart are one shape, rounded twice
 
 Straighten = Callable[[np.ndarray], np.ndarray]
@@ -119,13 +116,6 @@ def _refuse_unreadable_kind(path: Path) -> None:
             f"{path}: {suffix[1:].upper()} files need another package.",
             "Install it with `pip install -e '.[heic]'`, or convert them to JPEG first.",
         )
-
-
-def image_name(path: Path) -> str:
-    """The file name in `images/` of the photo at `path`: its stem without blanks, as PNG."""
-    stem = re.sub(r"[\s/\\:*?\"<>|]+", "_", path.stem)
-    stem = "_" + stem[1:] if stem.startswith(("-", ".")) else stem
-    return f"{stem}_.png" if stem in RESERVED_STEMS else f"{stem}.png"
 
 
 def examine(path: Path) -> Photo:

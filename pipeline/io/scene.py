@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,8 @@ FILE = "images.json"
 # Beside the images, where a capture brought its own: poses of the images as they lie here, keep masks.
 GIVEN_POSES = "transforms.json"
 GIVEN_MASKS = "masks"
+# `mean.exr` among the attention maps belongs to the temporal mean.
+RESERVED_STEMS = frozenset({"mean"})
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,13 @@ class Origin:
     masked: str = ""
     left_out: list[str] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
+
+
+def image_name(photo: Path) -> str:
+    """The file name in `images/` of a photo: its stem without blanks, as PNG."""
+    stem = re.sub(r"[\s/\\:*?\"<>|]+", "_", photo.stem)
+    stem = "_" + stem[1:] if stem.startswith(("-", ".")) else stem
+    return f"{stem}_.png" if stem in RESERVED_STEMS else f"{stem}.png"
 
 
 def write_images_json(

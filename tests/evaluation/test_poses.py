@@ -54,6 +54,13 @@ def test_true_cameras_turn_with_their_images(tmp_path):
     assert unit == "m"
 
 
+def test_a_true_camera_bears_its_photos_name(tmp_path):
+    path = tmp_path / "cameras.json"
+    write_json(path, {"frames": {"IMG 1.a": {"cam_from_world": np.eye(4).tolist()}}})
+    records = [ImageRecord("IMG_1.a.png", "IMG 1.a.jpg", "", 6, 4, None, "train", 0)]
+    assert [*read_true_cameras(path, records)[0]] == ["IMG_1.a.png"]
+
+
 def test_damaged_truth_is_told(tmp_path):
     path = tmp_path / "cameras.json"
     write_json(path, {"frames": {"a": {"cam_from_world": [1, 2]}}})

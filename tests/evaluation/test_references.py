@@ -29,6 +29,18 @@ def test_references_are_found_by_stem_whatever_their_suffix(tmp_path):
     assert {name: path.name for name, path in found.items()} == {"a.png": "a.png", "b.png": "b.jpg"}
 
 
+def test_references_are_renamed_as_ingest_renames_their_photos(tmp_path):
+    """`IMG 1.jpg` becomes the image IMG_1.png; `mean` is taken, by the temporal mean."""
+    for name in ("IMG 1.png", "mean.png", ".b.png", "c_d.png"):
+        write_image(tmp_path / name, picture(8, 6))
+    names = ("IMG_1.png", "mean_.png", "_b.png", "c_d.png")
+    found = find_references(tmp_path, [record(8, 6, name=name) for name in names])
+    assert [found[name].name for name in names] == ["IMG 1.png", "mean.png", ".b.png", "c_d.png"]
+    write_image(tmp_path / "IMG_1.png", picture(8, 6))
+    with pytest.raises(UserError, match="one image"):
+        find_references(tmp_path, [record(8, 6, name="IMG_1.png")])
+
+
 def test_a_missing_or_doubled_reference_is_named(tmp_path):
     write_image(tmp_path / "a.png", picture(8, 6))
     with pytest.raises(UserError, match=r"no reference for b\.png"):

@@ -13,10 +13,10 @@ from pipeline.io.photos import (
     convert,
     examine,
     final_size,
-    image_name,
     list_photos,
     plan_sizes,
 )
+from pipeline.io.scene import image_name
 
 ORIENTATION = 0x0112
 FOCAL_35MM = 0xA405
