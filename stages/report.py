@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -16,6 +17,8 @@ from pipeline.report import gather, notes, numbers
 from pipeline.report.page import Page, Photo, render
 from pipeline.report.plots import charts
 from pipeline.stage import Job, Section, run
+
+log = logging.getLogger(__name__)
 
 
 class Params(Section):
@@ -35,10 +38,7 @@ def main(job: Job, params: Params) -> str:
             f"Set report.compare: {job.variant} and leave --variant away.",
         )
     metrics = read_json(paths.metrics, made_by="evaluate")
-    wanted = "" if params.compare == "." else params.compare
-    other_paths = ScenePaths(job.root, job.scene, wanted) if wanted else None
-    other = gather.optional_json(other_paths.metrics) if other_paths else {}
-    compared = wanted if other else ""
+    other_paths, other, unmet = _other(job, params.compare)
     records = read_images_json(paths.images)
     pictures = map_named(
         gather.photo_pictures,
@@ -55,9 +55,9 @@ def main(job: Job, params: Params) -> str:
         headline=numbers.headline(metrics, other),
         tiles=numbers.tiles(metrics, other),
         table=numbers.table(metrics, other),
-        compared=compared,
+        compared=params.compare if other else "",
         photos=_photos(paths, records, pictures, dict(lost)),
-        charts=charts(paths, other_paths if compared else None, records),
+        charts=charts(paths, other_paths, records),
         coverage=heat,
         coverage_max=heat_max,
         masks_note=notes.masks_note(gather.optional_json(paths.masks / "masks.json"))
@@ -70,12 +70,26 @@ def main(job: Job, params: Params) -> str:
         intake=read_origin(paths.images).said,
         video=film,
         video_missing=film_missing,
-        missing=numbers.missing(metrics),
+        missing=numbers.missing(metrics) + unmet,
         conventions=metrics.get("conventions", {}),
     )
     with publish_dir(paths.report) as fresh:
         write_text(fresh / "index.html", render(page))
     return f"open {paths.report / 'index.html'}"
+
+
+def _other(
+    job: Job, variant: str
+) -> tuple[ScenePaths | None, dict[str, Any], list[tuple[str, str]]]:
+    """The fit to compare with, its numbers, and why there are none."""
+    if variant == ".":
+        return None, {}, []
+    paths = ScenePaths(job.root, job.scene, variant)
+    if metrics := gather.optional_json(paths.metrics):
+        return paths, metrics, []
+    unmet = numbers.unmet(job.scene, variant)
+    log.warning("%s", unmet[0][0])
+    return None, {}, unmet
 
 
 def _photos(

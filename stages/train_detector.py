@@ -56,7 +56,8 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Writes the weights, and beside them the validation curve as CSV."""
     start = job.resolve(params.start) if params.start else None
-    network = load_network(start, params.model) if start else DETECTORS[params.model]()
+    network = (load_network(start, params.model, named_by="train_detector.start") if start
+               else DETECTORS[params.model]())  # fmt: skip
     if start is None:
         network.initialise(params.seed)
     training, validation = _training(job, params), _validation(job, params)
@@ -104,8 +105,7 @@ def _training(job: Job, params: Params) -> list[Pool]:
                _painted(job, params.photos, params.seed, params.veils, veils=True)]  # fmt: skip
     rendered = [pools.read_rendered(job.resolve(path)) for path in params.rendered]
     pairs = [pools.read_photo_pairs(job.resolve(path)) for path in params.photo_pairs]
-    sources = [pools.together(parts) for parts in (painted, rendered, pairs)]
-    return pools.weighted(sources, params.shares)
+    return pools.weighted([pools.together(p) for p in (painted, rendered, pairs)], params.shares)
 
 
 def _validation(job: Job, params: Params) -> dict[str, Pool]:

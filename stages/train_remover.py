@@ -80,12 +80,12 @@ def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
     target = job.resolve(params.folder) / f"{method}.safetensors"
     store.save_remover(target, average, method)
     write_csv(target.with_suffix(".csv"), CURVE, rows)
-    before, after = rows[-1][3:]
-    return f"{target.name}: {before} -> {after} dB on pictures that it was not trained on"
+    return f"{target.name}: {rows[-1][3]} -> {rows[-1][4]} dB on pictures it was not trained on"
 
 
 def _trainer(job: Job, params: Params, method: Method) -> Trainer:
-    attention = load_network(job.resolve(params.attention)) if method == "attgan" else None
+    attention = (load_network(job.resolve(params.attention), named_by="train_remover.attention")
+                 if method == "attgan" else None)  # fmt: skip
     recipe = recipe_of(method, params.seed, attention=attention, map_loss=attention_loss,
                        train_attention=params.train_attention, steps=params.attention_steps,
                        published_edges=params.published_edges, added=params.added)  # fmt: skip

@@ -26,20 +26,23 @@ def save_network(path: Path, network: Detector) -> None:
     save_tensors(path, numbers, {"model": network.model})
 
 
-def load_network(path: Path, model: str = "attentive") -> Detector:
+def load_network(
+    path: Path, model: str = "attentive", named_by: str = "attention.weights"
+) -> Detector:
     """The network `model` with the weights of a file, in evaluation mode on the CPU.
 
     The file: safetensors, npz, or a PyTorch state dict, which is read without running code from it;
     for the attentive network also that of the whole official generator (what belongs to its
-    autoencoder is passed over). Raises UserError for a missing, unreadable, unsafe or unfitting file.
+    autoencoder is passed over). Raises UserError for a missing, unreadable, unsafe or unfitting file,
+    with the parameter that it is `named_by`.
     """
-    state = read_state(path, "Set attention.weights in params.yaml, or restore the file.")
+    state = read_state(path, f"Set {named_by} in params.yaml, or restore the file.")
     if path.suffix == ".safetensors":
         made_for = load_tensors(path)[1].get("model", model)
         if made_for != model:
             raise UserError(
                 f"{path} is for the detector {made_for!r}, not for {model!r}.",
-                "Change attention.model, or attention.weights, in params.yaml.",
+                f"Change {named_by} in params.yaml, or the model beside it.",
             )
     network = DETECTORS[model]()
     fill(network, _counts(network) | state, str(path))

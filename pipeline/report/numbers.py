@@ -81,6 +81,15 @@ def missing(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(reason, ", ".join(names)) for reason, names in by_reason.items()]
 
 
+def unmet(scene: str, variant: str) -> list[tuple[str, str]]:
+    """Why the fit to compare with is not shown, where it has no numbers: (reason, what)."""
+    reason = (
+        f"report.compare is {variant}, but artifacts/{scene}/{variant}/metrics.json does not exist: "
+        f"run `python -m stages.evaluate --scene {scene} --variant {variant}`, or correct it"
+    )
+    return [(reason, "the comparison")]
+
+
 def tiles(
     metrics: Mapping[str, Any], other: Mapping[str, Any] | None
 ) -> list[tuple[str, str, str]]:

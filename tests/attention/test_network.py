@@ -174,5 +174,9 @@ def test_a_file_that_holds_no_weights_is_a_user_error(tmp_path: Path, content: b
 
 
 def test_missing_weights_are_a_user_error(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="do not exist"):
+    with pytest.raises(UserError, match="do not exist") as error:
         load_network(tmp_path / "none.safetensors")
+    assert "attention.weights" in error.value.hint
+    with pytest.raises(UserError) as error:
+        load_network(tmp_path / "none.safetensors", named_by="train_remover.attention")
+    assert "Set train_remover.attention" in error.value.hint

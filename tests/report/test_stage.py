@@ -128,8 +128,17 @@ def test_a_page_without_truth_variant_video_or_fit(tmp_path):
     parse(html)
     assert "cannot be judged under the drops" in html
     assert "does not exist" in html and "no video was made" in html
-    assert "unmasked" not in html and "<video" not in html
+    assert ">unmasked<" not in html and "<video" not in html
     assert "None: every photo was placed." in html
+
+
+def test_a_comparison_without_numbers_is_told_on_the_page_and_on_the_terminal(tmp_path, caplog):
+    fabricate(tmp_path, count=3, lost=0)
+    html = make(tmp_path, variants=(None,))
+    told = "artifacts/made/unmasked/metrics.json does not exist"
+    assert told in html and told in caplog.text
+    caplog.clear()
+    assert told not in make(tmp_path) and told not in caplog.text
 
 
 def test_bad_calls_are_told(tmp_path):
