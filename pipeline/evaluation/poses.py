@@ -32,9 +32,7 @@ def read_true_cameras(
     content = read_json(path)
     try:
         frames = {
-            image_name(Path(f"{stem}.png")): np.asarray(
-                frame["cam_from_world"], np.float64
-            ).reshape(4, 4)
+            _key(stem): np.asarray(frame["cam_from_world"], np.float64).reshape(4, 4)
             for stem, frame in content["frames"].items()
         }
         unit = str(content.get("unit", "units of the true cameras"))
@@ -43,11 +41,16 @@ def read_true_cameras(
             f"{path} is not a list of true cameras ({error!r}).", "Restore the file."
         ) from None
     cameras = {
-        record.name: np.linalg.matrix_power(_QUARTER, record.turned // 90 % 4) @ frames[record.name]
+        record.name: np.linalg.matrix_power(_QUARTER, record.turned // 90 % 4) @ frames[key]
         for record in records
-        if record.name in frames
+        if (key := _key(record.stem)) in frames
     }
     return cameras, unit
+
+
+def _key(stem: str) -> str:
+    """By which a photo's camera and its image find each other."""
+    return image_name(Path(f"{stem}.png"))
 
 
 def pose_numbers(

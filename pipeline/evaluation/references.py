@@ -30,7 +30,8 @@ def find_references(folder: Path, records: Sequence[ImageRecord]) -> dict[str, P
             other = files[name].name
             raise UserError(f"{path} and {other} are references of one image.", "Keep one.")
         files[name] = path
-    missing = [record.name for record in records if record.name not in files]
+    wanted = {record.name: image_name(Path(record.name)) for record in records}
+    missing = [name for name, key in wanted.items() if key not in files]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         shown = ", ".join(missing[:3]) + more
@@ -38,7 +39,7 @@ def find_references(folder: Path, records: Sequence[ImageRecord]) -> dict[str, P
             f"{folder} has no reference for {shown}.",
             "A reference is named like its photo; move the folder away to go without references.",
         )
-    return {record.name: files[record.name] for record in records}
+    return {name: files[key] for name, key in wanted.items()}
 
 
 def read_reference(path: Path, record: ImageRecord, source: Path) -> np.ndarray:
