@@ -60,8 +60,8 @@ def main(job: Job, params: Params) -> str:
     far = max(view.far for view in views.values()) * params.far_factor
     if near >= far:
         raise UserError("Nothing is left between near and far.", "Lower nerf.near_factor.")
-    masks = job.paths.refine if params.use_masks else None
-    photos = photos_to_fit(read_posed_images(job.paths.images, masks, views), near, far)
+    keep_masks = job.paths.refine if params.use_masks else None
+    photos = photos_to_fit(read_posed_images(job.paths.images, keep_masks, views), near, far)
     settings = params.model_dump(include=SETTINGS)
     field = build_around(params.model, list(views.values()), near, far, **settings).to(job.device)
     buffer = RayBuffer(photos, params.seed, job.device)

@@ -57,9 +57,9 @@ def main(job: Job, params: Params) -> str:
             copy_keep_masks(paths.masks, fresh)
             write_json(fresh / "refine.json", {"mode": "none", "why": why, "rounds": {}})
         return f"the masks stay as they are: {why}"
-    masks = paths.masks if params.start != "none" else None
+    keep_masks = paths.masks if params.start != "none" else None
     views = read_transforms(paths.poses / "transforms.json")
-    images = read_posed_images(paths.images, masks, views)
+    images = read_posed_images(paths.images, keep_masks, views)
     records = [image.record for image in images]
     field = GrowingField(images, params.far_factor, params.seed, job.device)
     with publish_dir(paths.refine) as fresh:
@@ -88,23 +88,21 @@ def main(job: Job, params: Params) -> str:
 
 
 def _look(
-    job: Job, params: Params, field: GrowingField, masks: Sequence[np.ndarray], rounds: Path
+    job: Job, params: Params, field: GrowingField, drop_masks: Sequence[np.ndarray], rounds: Path
 ) -> list[np.ndarray | None]:
     """The residuals of the fitted images after a further fit; None for the held-out ones."""
-    drop_masks = {i.record.name: mask for i, mask in zip(field.images, masks, strict=True)}
+    drops = {i.record.name: mask for i, mask in zip(field.images, drop_masks, strict=True)}
     number = len(field.psnr)
-    field.fit(
-        drop_masks, params.steps if number else params.first_steps, params.batch_rays, cores()
-    )
+    field.fit(drops, params.steps if number else params.first_steps, params.batch_rays, cores())
     tasks = {image.record.name: (image,) for image in field.images}
     workers = None if job.device == "cpu" else 1
     views = map_named(field.view, tasks, job_label="render", workers=workers)
-    sure = field.sure(views, drop_masks, params.witnesses)
+    sure = field.sure(views, drops, params.witnesses)
     found: list[np.ndarray | None] = []
     for image in field.images:
         name, rgb = image.record.name, views[image.record.name].rgb
         if name in sure:
-            found.append(residual(rgb, image.rgb, ~drop_masks[name], sure[name]))
+            found.append(residual(rgb, image.rgb, ~drops[name], sure[name]))
         else:
             found.append(None)
             write_image(rounds / f"{number}/test/{name}", rgb)

@@ -70,30 +70,30 @@ def _render(nerf: Path, device: str, view: View, pose: np.ndarray, scale: float)
 
 
 def _one_view(view: View, split: str, fill: tuple[float, float], device: str, *where: Path) -> None:
-    nerf, images, masks, out = where
+    nerf, images, kept, out = where
     seen = _render(nerf, device, view, view.cam_from_world, 1.0)
     write_image(out / ("test" if split == "test" else "input") / view.name, seen.rgb)
     write_depth(out / "depth" / f"{Path(view.name).stem}.exr", seen.depth)
     photo = read_image(images / view.name, size=(view.width, view.height))
-    keep_mask = _keep_mask(masks, view.name, seen.depth)
+    keep_mask = _keep_mask(kept, view.name, seen.depth)
     mixed = composite_photo(photo, seen.rgb, keep_mask, feather_px=fill[0], reach_px=fill[1])
     write_image(out / "composite" / view.name, mixed)
 
 
 @functools.lru_cache(maxsize=512)
-def _witness(masks: Path, out: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _witness(kept: Path, out: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     depth = read_depth(out / "depth" / f"{Path(name).stem}.exr")
-    return _keep_mask(masks, name, depth), depth
+    return _keep_mask(kept, name, depth), depth
 
 
-def _keep_mask(masks: Path, name: str, depth: np.ndarray) -> np.ndarray:
+def _keep_mask(kept: Path, name: str, depth: np.ndarray) -> np.ndarray:
     size = (depth.shape[1], depth.shape[0])
-    return read_keep_mask(masks / name, size) if masks.is_dir() else np.ones(depth.shape, bool)
+    return read_keep_mask(kept / name, size) if kept.is_dir() else np.ones(depth.shape, bool)
 
 
-def _count_seen(view: View, train: tuple[View, ...], masks: Path, out: Path) -> dict[str, float]:
+def _count_seen(view: View, train: tuple[View, ...], kept: Path, out: Path) -> dict[str, float]:
     def witness(one: View) -> Witness:
-        return Witness(one.cam_from_world, one.intrinsics, *_witness(masks, out, one.name))
+        return Witness(one.cam_from_world, one.intrinsics, *_witness(kept, out, one.name))
 
     count = witness_count(witness(view), [witness(one) for one in train])
     write_map(out / "seen" / f"{Path(view.name).stem}.exr", count.astype(np.float32))

@@ -56,9 +56,9 @@ class StraightScene:
 
 def read_straight(paths: ScenePaths) -> StraightScene:
     """The scene with the last masks that there are; UserError when no image has a pose."""
-    masks = paths.refine if paths.refine.is_dir() else paths.masks
+    keep_masks = paths.refine if paths.refine.is_dir() else paths.masks
     views = read_transforms(paths.poses / "transforms.json")
-    images = read_posed_images(paths.images, masks if masks.is_dir() else None, views)
+    images = read_posed_images(paths.images, keep_masks if keep_masks.is_dir() else None, views)
     if not images:
         raise UserError(f"{paths.poses} has no posed image.", "Run `python -m stages.poses`.")
     posed = [image.view for image in images]
