@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import psutil
 
+from pipeline.errors import UserError
 from pipeline.io.images import read_image
 from pipeline.io.masks import read_keep_mask
 from pipeline.io.scene import ImageRecord, read_images_json
 from pipeline.io.transforms import View
+
+# Per pixel in a fit: colours as float32, a mask, and in the shuffled rays the colours and two orders.
+HELD_BYTES = 25
 
 
 @dataclass(frozen=True)
@@ -25,20 +30,34 @@ class PosedImage:
 
 
 def read_posed_images(
-    images: Path, masks: Path | None, views: Mapping[str, View]
+    images: Path, keep_masks: Path | None, views: Mapping[str, View]
 ) -> list[PosedImage]:
     """The images that have a pose, in name order, held-out ones included.
 
-    Without a folder of `masks` every pixel is kept. UserError when a file is missing or damaged.
+    Without a folder of `keep_masks` every pixel is kept. UserError when a file is missing or damaged,
+    or when the memory that is free cannot hold what a fit of them holds.
     """
+    records = [record for record in read_images_json(images) if record.name in views]
+    _refuse_too_large(records)
     found = []
-    for record in read_images_json(images):
-        view = views.get(record.name)
-        if view is None:
-            continue
+    for record in records:
+        view = views[record.name]
         rgb = read_image(images / record.name, size=(view.width, view.height))
         keep_mask = np.ones(rgb.shape[:2], bool)
-        if masks is not None:
-            keep_mask = read_keep_mask(masks / record.name, (view.width, view.height))
+        if keep_masks is not None:
+            keep_mask = read_keep_mask(keep_masks / record.name, (view.width, view.height))
         found.append(PosedImage(record, view, rgb, keep_mask))
     return found
+
+
+def _refuse_too_large(records: Sequence[ImageRecord]) -> None:
+    """Told by their listed sizes, before any is read: else the system would end the fit without a word."""
+    needed = HELD_BYTES * sum(record.width * record.height for record in records)
+    free = psutil.virtual_memory().available + psutil.swap_memory().free
+    if needed > free:
+        width, height = records[0].size
+        raise UserError(
+            f"{len(records)} photos of {width}x{height} need about {needed / 1e9:.1f} GB of memory in a "
+            f"fit; {free / 1e9:.1f} GB are free.",
+            "Lower ingest.max_size or ingest.frames, or end other programs.",
+        )

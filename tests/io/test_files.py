@@ -2,16 +2,20 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
 import numpy as np
+import psutil
 import pytest
 
 from pipeline.errors import UserError
 from pipeline.io.images import read_image, write_image
 from pipeline.io.maps import read_depth, read_map, write_depth, write_map
 from pipeline.io.masks import read_keep_mask, write_keep_mask
+from pipeline.io.posed import read_posed_images
+from pipeline.io.scene import ImageRecord, write_images_json
 from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.io.transforms import View, read_transforms, write_transforms
 from pipeline.io.video import write_video
@@ -174,3 +178,19 @@ def test_a_video_has_every_frame_even_sides_and_the_same_bytes(
         decoded = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(decoded) == 7
     assert decoded[0].shape == (32, 46, 3)
+
+
+@pytest.mark.parametrize("spare", [-1, 0])
+def test_photos_that_do_not_fit_into_memory_are_told_before_any_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spare: int
+) -> None:
+    """Two photos of 64x48 at 25 bytes per pixel: a byte less is refused, just enough is not."""
+    memory, swap = 2 * 64 * 48 * 25 - 10_000 + spare, 10_000
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory))
+    monkeypatch.setattr(psutil, "swap_memory", lambda: SimpleNamespace(free=swap))
+    names = ("a.png", "b.png")
+    records = [ImageRecord(name, name, "", 64, 48, None, "train", 0) for name in names]
+    write_images_json(tmp_path, records)
+    told = r"2 photos of 64x48 need about 0\.0 GB" if spare else r"a\.png does not exist"
+    with pytest.raises(UserError, match=told):
+        read_posed_images(tmp_path, None, {name: _view(name) for name in names})
