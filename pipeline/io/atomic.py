@@ -146,3 +146,11 @@ def read_json(path: Path, made_by: str = "") -> Any:
         raise UserError(f"{path} does not exist.", hint) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path} is damaged: {error}.", hint.replace("first", "again")) from None
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array in a .npy file; UserError when it is damaged or holds Python objects."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path} is not a readable array ({error}).") from None

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.io.atomic import read_npy
 from pipeline.io.given import GivenView, checked_rigid
 from pipeline.io.transforms import View
 
@@ -65,11 +66,3 @@ def read_poses_bounds(path: Path, photos: Sequence[Path]) -> list[GivenView]:
             )
         )
     return views
-
-
-def read_npy(path: Path) -> np.ndarray:
-    """The array in a .npy file; UserError when it is damaged or holds Python objects."""
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} is not a readable array ({error}).") from None

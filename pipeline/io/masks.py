@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import write_bytes
+from pipeline.io.atomic import read_npy, write_bytes
 
 
 def write_keep_mask(path: Path, keep_mask: np.ndarray) -> None:
@@ -84,10 +84,7 @@ def read_rain_mask(path: Path, count: int) -> np.ndarray:
 
     Soft masks are cut at 0.5. UserError when damaged, of another shape, or not within [0, 1].
     """
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} is not a readable array ({error}).") from None
+    values = read_npy(path)
     if values.ndim != 3 or values.shape[2] != count:
         raise UserError(
             f"{path} has shape {values.shape}; (height, width, {count}) is expected.",
