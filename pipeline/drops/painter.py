@@ -235,7 +235,6 @@ def scatter(
     stock = _templates()
     low, high = radius_range_px
     half = np.array([size[1] / 2 + margin, size[0] / 2 + margin])
-    power = 1 - size_exponent
     wanted = coverage * 4 * half[0] * half[1]
     angle = rng.uniform(*contact_angle_range)  # of one pane: drops on it resemble each other
     drops: list[Drop] = []
@@ -244,11 +243,7 @@ def scatter(
     for _ in range(5 * max_drops):
         if area >= wanted or len(drops) >= max_drops:
             break
-        draw = rng.random()
-        if abs(power) < 1e-6:
-            radius = low * (high / low) ** draw
-        else:
-            radius = (low**power + draw * (high**power - low**power)) ** (1 / power)
+        radius = _radius(rng, low, high, size_exponent)
         if area > 0 and np.pi * radius**2 > 2.0 * (wanted - area):
             continue
         center = rng.uniform(-half - 0.6 * radius, half + 0.6 * radius)
@@ -272,3 +267,11 @@ def scatter(
         )
         area += np.pi * radius**2
     return drops
+
+
+def _radius(rng: np.random.Generator, low: float, high: float, exponent: float) -> float:
+    """Drawn from `low` to `high` with a density that falls as the radius to the power -`exponent`."""
+    draw, power = rng.random(), 1 - exponent
+    if abs(power) < 1e-6:
+        return low * (high / low) ** draw
+    return (low**power + draw * (high**power - low**power)) ** (1 / power)

@@ -19,7 +19,7 @@ from pipeline.io.transforms import View
 from pipeline.sfm.database import Progress, build_database
 from pipeline.sfm.model import points_of, with_depths
 from pipeline.sfm.reconstruct import check_inputs, silent
-from pipeline.sfm.result import Attempt, LostImage, Reconstructed, Settings
+from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
 
 log = logging.getLogger(__name__)
 
@@ -121,38 +121,17 @@ def triangulate(
         database, image_dir, mask_dir, sizes, {}, settings,
         seed=seed, threads=threads, progress=report,
     )  # fmt: skip
-    out = work_dir / "models"
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir()
-    pycolmap.set_random_seed(seed)
     report("triangulating", 0, 1)
-    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed)
-    model = pycolmap.triangulate_points(
-        _posed_model(database, given), database, image_dir, out,
-        clear_points=True, options=options, refine_intrinsics=False,
-    )  # fmt: skip
+    model = _with_points(_posed_model(database, given), database, image_dir, work_dir, seed)
     report("triangulating", 1, 1)
     _check_fit(model, sum(matching.matched[name] for name in given), image_dir)
     views = {name: with_depths(view, model, depth_margin) for name, view in sorted(given.items())}
-    blind = [name for name, view in views.items() if not 0 < view.near < view.far]
-    if blind:
-        raise UserError(
-            f"the photos show no points before {', '.join(blind)}: their depths stay unknown.",
-            "Give near and far depths with the poses, or set poses.use_given: false.",
-        )
+    _check_depths(views)
     xyz, rgb, error = points_of(model)
     reprojection = model.compute_mean_reprojection_error() if len(xyz) else 0.0
-    lost = [
-        LostImage(
-            name, matching.keypoints[name], matching.best_match[name], matching.best_partner[name],
-            "the capture has no pose for it",
-        )
-        for name in names
-        if name not in given
-    ]  # fmt: skip
     return Reconstructed(
         views=views,
-        lost=lost,
+        lost=[_unposed(name, matching) for name in names if name not in given],
         points_xyz=xyz,
         points_rgb=rgb,
         points_error=error,
@@ -163,6 +142,37 @@ def triangulate(
         settings=settings,
         model=model,
     )
+
+
+def _with_points(
+    posed: pycolmap.Reconstruction, database: Path, image_dir: Path, work_dir: Path, seed: int
+) -> pycolmap.Reconstruction:
+    """The posed model with the points that its matches show, cameras and poses unchanged."""
+    out = work_dir / "models"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed)
+    return pycolmap.triangulate_points(
+        posed, database, image_dir, out,
+        clear_points=True, options=options, refine_intrinsics=False,
+    )  # fmt: skip
+
+
+def _unposed(name: str, matching: Matching) -> LostImage:
+    return LostImage(
+        name, matching.keypoints[name], matching.best_match[name], matching.best_partner[name],
+        "the capture has no pose for it",
+    )  # fmt: skip
+
+
+def _check_depths(views: Mapping[str, View]) -> None:
+    blind = [name for name, view in views.items() if not 0 < view.near < view.far]
+    if blind:
+        raise UserError(
+            f"the photos show no points before {', '.join(blind)}: their depths stay unknown.",
+            "Give near and far depths with the poses, or set poses.use_given: false.",
+        )
 
 
 def _check_fit(model: pycolmap.Reconstruction, matched: int, image_dir: Path) -> None:
