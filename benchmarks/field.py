@@ -22,7 +22,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "field"))
 
-from scene import camera, photograph  # noqa: E402
+from scene import camera, photograph  # type: ignore[import-not-found]  # noqa: E402
 
 from pipeline.field.buffer import PosedPhoto, RayBuffer  # noqa: E402
 from pipeline.field.fit import fit  # noqa: E402

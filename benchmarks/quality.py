@@ -96,6 +96,7 @@ def load(folder: Path, artifacts: Path) -> Scene:
     coverage = {}
     for stem in photos:
         raw = cv2.imread(str(truth / "coverage" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+        assert raw is not None, stem
         coverage[stem] = raw.astype(np.float32) / np.iinfo(raw.dtype).max
     poses = artifacts / "poses" / "transforms.json"
     sfm = {Path(n).stem: v for n, v in read_transforms(poses).items()} if poses.is_file() else {}

@@ -28,6 +28,7 @@ from pipeline.field import fused
 from pipeline.field.buffer import RayBuffer
 from pipeline.field.encoding import add_rows, gather
 from pipeline.field.fit import fit
+from pipeline.field.grid_field import GridField
 from pipeline.field.render import render_view
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,6 +59,7 @@ def machine(kind: torch.dtype) -> tuple[float, float]:
 def stages(settings: dict[str, Any]) -> None:
     """Milliseconds of each part of one step, beside its floor."""
     train, _, model = photos_and_field("fast", settings, views=4)
+    assert isinstance(model, GridField)
     half = model.config.half
     flops, bandwidth = machine(torch.bfloat16 if half else torch.float32)
     print(f"one thread: {flops / 1e9:.0f} GFLOP/s (32768x64 by 64x64, "

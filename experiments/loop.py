@@ -74,7 +74,7 @@ def picture(root: Path, scene: str) -> np.ndarray:
     for where, colour in (
         (drop_mask & true, FOUND), (drop_mask & ~true, TOO_MUCH), (~drop_mask & true, MISSED),
     ):  # fmt: skip
-        marked[where] = 0.45 * marked[where] + 0.55 * np.float32(colour)
+        marked[where] = 0.45 * marked[where] + 0.55 * np.array(colour, np.float32)
     return np.concatenate([photo, marked], axis=1)
 
 

@@ -66,6 +66,7 @@ def scene_cases(folder: Path) -> list[Case]:
         truth = folder / "truth" / "coverage" / f"{path.stem}.png"
         if path.suffix.lower() in PHOTO_SUFFIXES and truth.is_file():
             cover = cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE)
+            assert cover is not None, truth
             cases.append((path.stem, _unit(read_photo(path)[0]), cover / 255 > VISIBLE_COVERAGE))
     return cases
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from pipeline.attention.inference import attend
-from pipeline.attention.weights import load_network
+from pipeline.attention.weights import Detector, load_network
 from pipeline.parallel import cores
 
 SIZES = ((480, 360), (1920, 1080))
@@ -34,7 +34,7 @@ def main() -> None:
         for width, height in SIZES:
             photo = np.random.default_rng(0).random((height, width, 3), np.float32)
 
-            def once(_: int = 0, photo: np.ndarray = photo, network=network) -> float:
+            def once(_: int = 0, photo: np.ndarray = photo, network: Detector = network) -> float:
                 start = time.perf_counter()
                 attend(network, photo, steps=flags.steps)
                 return time.perf_counter() - start

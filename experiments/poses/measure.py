@@ -83,6 +83,7 @@ def _brought_in(photos: Path, target: Path) -> dict[str, float]:
 def _true_masks(coverage: Path, images: Path, target: Path) -> Path:
     for path in sorted(images.glob("*.png")):
         share = cv2.imread(str(coverage / path.name), cv2.IMREAD_GRAYSCALE)
+        assert share is not None, coverage / path.name
         write_keep_mask(target / path.name, share <= COVERED * 255)
     return target
 

@@ -43,7 +43,7 @@ class Case(NamedTuple):
     group: str
     name: str
     window: list[np.ndarray]
-    index: int
+    scored: int
     clean: np.ndarray
     wet: np.ndarray
 
@@ -89,11 +89,11 @@ def restored(method: str, weights: Path, case: Case, keep_clear: bool) -> np.nda
     """The photo as the stage `restore` makes it."""
     networks = networks_of(method, weights, "", "cpu")
     if method == "wen":
-        return clean_wen(networks[0], case.window, case.index, keep_clear=keep_clear)  # type: ignore[arg-type]
+        return clean_wen(networks[0], case.window, case.scored, keep_clear=keep_clear)  # type: ignore[arg-type]
     if method == "quan":
-        return clean_quan(networks[0], case.window[case.index])  # type: ignore[arg-type]
+        return clean_quan(networks[0], case.window[case.scored])  # type: ignore[arg-type]
     attend = partial(_last_map, networks[0])
-    return clean_attgan(networks[1], case.window[case.index], attend)  # type: ignore[arg-type]
+    return clean_attgan(networks[1], case.window[case.scored], attend)  # type: ignore[arg-type]
 
 
 def figures(found: np.ndarray, case: Case) -> list[float]:
@@ -126,7 +126,7 @@ def main() -> None:
     rows: dict[str, list[list[float]]] = {}
     lines = []
     for case in (case for each in cases for case in each):
-        rainy = case.window[case.index]
+        rainy = case.window[case.scored]
         done = restored(flags.method, weights, case, not flags.plain)
         row = [*figures(rainy, case), *figures(done, case)]
         rows.setdefault(case.group, []).append(row)

@@ -47,6 +47,12 @@ def clean_counts(
     return np.concatenate(counts)
 
 
+def _coverage(path: Path) -> np.ndarray:
+    stored = cv2.imread(str(path), -1)
+    assert stored is not None, path
+    return stored / 255
+
+
 def read(data: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Depth, coverage, poses and intrinsics of a scene."""
     truth = data / "truth"
@@ -56,7 +62,7 @@ def read(data: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     if (truth / "alpha").is_dir():
         alpha = [read_map(truth / f"alpha/{stem}.exr", "synthesize") for stem in stems]
     else:
-        alpha = [cv2.imread(str(truth / f"coverage/{stem}.png"), -1) / 255 for stem in stems]
+        alpha = [_coverage(truth / f"coverage/{stem}.png") for stem in stems]
     poses = np.array([cameras["frames"][stem]["cam_from_world"] for stem in stems])
     k = np.array([[cameras["fx"], 0, cameras["cx"]], [0, cameras["fy"], cameras["cy"]], [0, 0, 1]])
     return depth, np.stack(alpha), poses, k
