@@ -56,7 +56,7 @@ def table(root: Path, scene: str) -> list[str]:
     lines = [_line(scene, "masks", drawn, "")]
     for number, numbers in score_rounds(paths.refine, files, COVERED).items():
         told = about["rounds"][number]
-        window = f", over {told['window']} neighbours" if told["window"] else ""
+        window = f", over {told['window']} neighbours" if told.get("window") else ""
         lines.append(_line(scene, number, numbers, told["glass"] + window))
     return [*lines, f"| {scene} | ended: {about['why']} |"]
 
