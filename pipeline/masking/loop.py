@@ -93,7 +93,8 @@ def repair(
         found, glass = seeker.again(residuals, (found, glass), told)
         if doubt := _doubt(found, use_attention):
             break
-        width = _width(window, found, residuals if told is None else told, cameras)
+        if told is None or found.mode != done[-1].found.mode:  # else the same maps tell the same
+            width = _width(window, found, residuals if told is None else told, cameras)
         redrawn = redrawn_on(glass, residuals, old, width=width)
         if not redrawn.contrast >= contrast:
             doubt = f"the disagreement is only {redrawn.contrast:.1f} times as large on it"

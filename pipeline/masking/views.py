@@ -58,11 +58,14 @@ def redraw_views(
     join = JOIN
     if attentions is not None:
         join = JOIN_ON_PANE if isinstance(glass, PaneGlass) else JOIN_ON_LENS
+    everything = range(count)
     cache: dict[range, Redrawn] = {}
+    overall = gather(glass, residuals, everything, quantile)
 
     def redrawn(views: range) -> Redrawn:
         if views not in cache:
-            gathered, votes = gather(glass, residuals, views, quantile)
+            apart = views != everything
+            gathered, votes = gather(glass, residuals, views, quantile) if apart else overall
             old, _ = gather(glass, [m.astype(np.float32) for m in drop_masks], views, None)
             seen = None if attentions is None else gather(glass, attentions, views, None)[0]
             reach = max(drop_masks[0].shape) / SURROUNDINGS
@@ -79,10 +82,9 @@ def redraw_views(
         fresh.append(dilate(np.where(np.isfinite(margin), margin > 0, old), dilation))
         known.append(np.nan_to_num(glass.to_view(view, found.known.astype(np.float32))).mean())
     facts = list(cache.values())
-    gathered, _ = gather(glass, residuals, range(count), quantile)
     return RedrawnViews(
         fresh,
-        np.nan_to_num(gathered),
+        np.nan_to_num(overall[0]),
         float(np.median([found.contrast for found in facts])),
         float(np.median([found.level for found in facts])),
         float(np.mean(known)),

@@ -179,8 +179,8 @@ def recipe_of(
         assert attention is not None
         recipe = AttganRecipe(attention, map_loss, train_attention=train_attention, steps=steps)
     else:
-        quan = QuanRecipe(added, published_edges=published_edges)
-        recipe = quan if method == "quan" else WenRecipe(added)
+        quans = method == "quan"
+        recipe = QuanRecipe(added, published_edges=published_edges) if quans else WenRecipe(added)
     recipe.begin(seed)
     return recipe
 
@@ -211,5 +211,5 @@ def check_crop(recipe: AnyRecipe, crop: int, adversarial: bool) -> None:
 
 def weights_of(recipe: nn.Module) -> Mapping[str, Tensor]:
     """The networks' tensors under their published names, as `restore` loads them."""
-    parts = [name.split(".", 1) for name in recipe.state_dict()]
-    return {name: recipe.state_dict()[f"{part}.{name}"] for part, name in parts if part != "guides"}
+    parts = [(*name.split(".", 1), value) for name, value in recipe.state_dict().items()]
+    return {name: value for part, name, value in parts if part != "guides"}
