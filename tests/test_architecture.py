@@ -135,11 +135,7 @@ def test_imports_run_one_way() -> None:
 LONG_FUNCTIONS = {
     "pipeline/drops/places_room.py:shelf",
     "pipeline/drops/places_room.py:shell",
-    "pipeline/drops/places_room.py:build",
     "pipeline/drops/places_street.py:window",
-    "pipeline/drops/places_street.py:house",
-    "pipeline/drops/places_street.py:build",
-    "pipeline/drops/places_things.py:stall",
 }
 
 

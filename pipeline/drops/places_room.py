@@ -290,6 +290,55 @@ def garden(b: Builder, rng: Rng, back: float) -> None:
         )
 
 
+def posters(b: Builder, rng: Rng, half: float, back: float) -> None:
+    """Pictures along both side walls, `half` the room's width to either side."""
+    for x, way in ((-half + 0.03, [0, 0, 1.0]), (half - 0.03, [0, 0, -1.0])):
+        for z in np.arange(4.0, back - 0.8, 0.9):
+            size = rng.uniform(0.45, 0.7)
+            b.panel(
+                "poster",
+                at(x, rng.uniform(1.9, 2.6), z),
+                np.asarray(way) * size,
+                [0, size * 1.2, 0],
+                cell=cell(rng),
+            )
+
+
+def hanging_lamps(b: Builder, rng: Rng, tall: float) -> list[LampPair]:
+    """Two shades on rods from the ceiling at `tall`, and their lights."""
+    lamps: list[LampPair] = []
+    for x in rng.uniform(-2.2, 2.2, 2):
+        z, drop = rng.uniform(4.5, 6.0), rng.uniform(0.7, 1.0)
+        b.tube("metal", [at(x, tall, z), at(x, tall - drop, z)], 0.012)
+        b.lathe(
+            "metal",
+            at(x, tall - drop - 0.25, z),
+            [(0.03, 0.26), (0.1, 0.2), (0.24, 0.0)],
+            sides=18,
+            tint=rng.uniform(0.5, 2.5, 3),
+        )
+        b.ball(
+            "paint", at(x, tall - drop - 0.24, z), np.full(3, 0.07), glow=1.5, tint=(1, 0.85, 0.6)
+        )
+        lamps.append((_xyz(at(x, tall - drop - 0.36, z)), (2.2, 1.7, 1.1)))
+    return lamps
+
+
+def crates(b: Builder, rng: Rng) -> None:
+    """Four crates on the floor, each with something on it."""
+    for _ in range(4):
+        spot = at(rng.uniform(-2.5, 2.5), 0, rng.uniform(3.8, 6.5))
+        b.box(
+            "wood",
+            spot - offset(0, 0.18, 0),
+            (0.5, 0.36, 0.4),
+            yaw=rng.uniform(-1, 1),
+            tile=0.5,
+            tint=rng.uniform(0.6, 1.4) * np.ones(3),
+        )
+        thing(b, rng, (spot - offset(0, 0.36, 0)).astype(np.float32), 0.26)
+
+
 def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
     """A study, laid out at random, and its lamps as (position, intensity)."""
     b = Builder(textures(rng), step=0.16)
@@ -303,16 +352,7 @@ def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
     shelf(b, rng, at(-half + 0.02, 0, 4.2), left, 2.2, rng.uniform(1.8, 2.6))
     if rng.random() < 0.6:
         shelf(b, rng, at(half - 0.02, 0, 6.2), right, 2.0, rng.uniform(1.3, 2.4))
-    for x, way in ((-half + 0.03, [0, 0, 1.0]), (half - 0.03, [0, 0, -1.0])):
-        for z in np.arange(4.0, back - 0.8, 0.9):
-            size = rng.uniform(0.45, 0.7)
-            b.panel(
-                "poster",
-                at(x, rng.uniform(1.9, 2.6), z),
-                np.asarray(way) * size,
-                [0, size * 1.2, 0],
-                cell=cell(rng),
-            )
+    posters(b, rng, half, back)
     b.panel(
         "cloth",
         at(-1.4, 0.015, 6.4),
@@ -336,32 +376,9 @@ def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
             at(side * rng.uniform(1.7, 2.5), 0, rng.uniform(4.0, 5.5)),
             rng.uniform(0.8, 1.1),
         )
-    for x in rng.uniform(-2.2, 2.2, 2):
-        z, drop = rng.uniform(4.5, 6.0), rng.uniform(0.7, 1.0)
-        b.tube("metal", [at(x, tall, z), at(x, tall - drop, z)], 0.012)
-        b.lathe(
-            "metal",
-            at(x, tall - drop - 0.25, z),
-            [(0.03, 0.26), (0.1, 0.2), (0.24, 0.0)],
-            sides=18,
-            tint=rng.uniform(0.5, 2.5, 3),
-        )
-        b.ball(
-            "paint", at(x, tall - drop - 0.24, z), np.full(3, 0.07), glow=1.5, tint=(1, 0.85, 0.6)
-        )
-        lamps.append((_xyz(at(x, tall - drop - 0.36, z)), (2.2, 1.7, 1.1)))
+    lamps += hanging_lamps(b, rng, tall)
     # Lamps behind the camera, out of its sight.
     for x in (-1.6, 1.6):
         lamps.append((_xyz(at(x, tall - 0.5, -0.3)), (5.5, 4.8, 3.9)))
-    for _ in range(4):
-        spot = at(rng.uniform(-2.5, 2.5), 0, rng.uniform(3.8, 6.5))
-        b.box(
-            "wood",
-            spot - offset(0, 0.18, 0),
-            (0.5, 0.36, 0.4),
-            yaw=rng.uniform(-1, 1),
-            tile=0.5,
-            tint=rng.uniform(0.6, 1.4) * np.ones(3),
-        )
-        thing(b, rng, (spot - offset(0, 0.36, 0)).astype(np.float32), 0.26)
+    crates(b, rng)
     return b, lamps

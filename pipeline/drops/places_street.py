@@ -60,12 +60,17 @@ def textures(rng: Rng) -> dict[str, Array]:
     }
 
 
+def front(right: Array) -> tuple[Array, Array, float]:
+    """Out of a front along the unit `right`, up, and its angle about the vertical."""
+    out = np.cross(np.array([0, 1, 0], np.float32), right)
+    return out, np.array([0, -1, 0], np.float32), float(np.arctan2(-right[2], right[0]))
+
+
 def window(
     b: Builder, rng: Rng, middle: Array, right: Array, w: float, h: float, paint: Array
 ) -> None:
     """Window in a wall: pane, frame, cross bars, sill and perhaps shutters; `right` is a unit."""
-    out = np.cross(np.array([0, 1, 0], np.float32), right)
-    yaw = float(np.arctan2(-right[2], right[0]))
+    out, _, yaw = front(right)
     corner = middle - right * w / 2 - np.array([0, h / 2, 0], np.float32) + out * 0.02
     b.panel("window", corner, right * w, [0, h, 0], cell=cell(rng), step=0.5)
     white = (0.95, 0.94, 0.9) if rng.random() < 0.7 else paint
@@ -117,9 +122,7 @@ def window(
 
 def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, paint: Array) -> None:
     """Ground floor of a shop: big panes, a door, a lettered board, sometimes an awning."""
-    out = np.cross(np.array([0, 1, 0], np.float32), right)
-    yaw = float(np.arctan2(-right[2], right[0]))
-    up = np.array([0, -1, 0], np.float32)
+    out, up, yaw = front(right)
     b.box(
         "wood",
         left + right * width / 2 + up * 0.35 + out * 0.06,
@@ -160,11 +163,51 @@ def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, pa
         )
 
 
+def roof(b: Builder, rng: Rng, corner: Array, right: Array, width: float) -> None:
+    """A tiled slope and a chimney, from the eaves' left `corner` along the unit `right`."""
+    out, up, yaw = front(right)
+    ridge = rng.uniform(1.2, 2.0)
+    eave = corner + out * 0.35 - right * 0.1
+    slope = out * -2.4 + up * ridge
+    b.panel(
+        "tiles",
+        eave + slope,
+        right * (width + 0.2),
+        -slope,
+        tile=1.4,
+        tint=rng.uniform(0.75, 1.15) * np.ones(3),
+    )
+    stack = eave + slope * 0.7 + right * rng.uniform(0.15, 0.85) * width
+    b.box("brick", stack + up * 0.4, (0.55, 1.5, 0.5), yaw=yaw, tile=1.6, tint=(0.8, 0.75, 0.75))
+    for k in (-0.12, 0.12):
+        b.tube("tiles", [stack + up * 1.1 + right * k, stack + up * 1.5 + right * k], 0.08)
+
+
+def ground_floor(
+    b: Builder, rng: Rng, left: Array, right: Array, width: float, paint: Array
+) -> None:
+    """A door in the middle with a step before it, and windows to its sides."""
+    out, up, yaw = front(right)
+    n = max(1, round(width / 1.5))
+    for k in range(n):
+        p = left + right * width * (k + 0.5) / n
+        if k == n // 2:
+            b.box(
+                "wood",
+                p + up * 1.05 + out * 0.03,
+                (0.95, 2.1, 0.1),
+                yaw=yaw,
+                tint=paint * 1.7,
+                tile=0.9,
+            )
+            b.box("stone", p + up * 0.08 + out * 0.3, (1.3, 0.16, 0.6), yaw=yaw)
+        else:
+            window(b, rng, p + up * 1.6, right, 0.85, 1.3, paint)
+
+
 def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height: float) -> None:
     """Front of a house, from its ground-left corner along the unit `right`, roof and chimney."""
-    out = np.cross(np.array([0, 1, 0], np.float32), right)
-    yaw = float(np.arctan2(-right[2], right[0]))
-    up = np.array([0, -1, 0], np.float32)
+    out, up, yaw = front(right)
     paint = np.asarray(PAINTS[int(rng.integers(0, len(PAINTS)))], np.float32)
     kind = ("brick", "plaster", "stone")[int(rng.choice(3, p=(0.45, 0.4, 0.15)))]
     tint = (
@@ -186,39 +229,11 @@ def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
             yaw=yaw,
             tile=0.8,
         )
-    ridge = rng.uniform(1.2, 2.0)
-    eave = left + up * height + out * 0.35 - right * 0.1
-    slope = out * -2.4 + up * ridge
-    b.panel(
-        "tiles",
-        eave + slope,
-        right * (width + 0.2),
-        -slope,
-        tile=1.4,
-        tint=rng.uniform(0.75, 1.15) * np.ones(3),
-    )
-    stack = eave + slope * 0.7 + right * rng.uniform(0.15, 0.85) * width
-    b.box("brick", stack + up * 0.4, (0.55, 1.5, 0.5), yaw=yaw, tile=1.6, tint=(0.8, 0.75, 0.75))
-    for k in (-0.12, 0.12):
-        b.tube("tiles", [stack + up * 1.1 + right * k, stack + up * 1.5 + right * k], 0.08)
+    roof(b, rng, left + up * height, right, width)
     if rng.random() < 0.65 and width > 2.6:
         shop_front(b, rng, left + out * 0.02, right, width, paint)
     else:
-        n = max(1, round(width / 1.5))
-        for k in range(n):
-            p = left + right * width * (k + 0.5) / n
-            if k == n // 2:
-                b.box(
-                    "wood",
-                    p + up * 1.05 + out * 0.03,
-                    (0.95, 2.1, 0.1),
-                    yaw=yaw,
-                    tint=paint * 1.7,
-                    tile=0.9,
-                )
-                b.box("stone", p + up * 0.08 + out * 0.3, (1.3, 0.16, 0.6), yaw=yaw)
-            else:
-                window(b, rng, p + up * 1.6, right, 0.85, 1.3, paint)
+        ground_floor(b, rng, left, right, width, paint)
     columns = max(1, round(width / rng.uniform(1.25, 1.7)))
     for level in np.arange(4.0, height - 0.6, 2.2):
         for k in range(columns):
@@ -235,12 +250,8 @@ def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
     b.tube("metal", [gutter + up * height, gutter + up * 1.5, gutter], 0.05)
 
 
-def build(rng: Rng) -> Builder:
-    """A street corner, laid out at random: metres, camera at EYE above the ground."""
-    b = Builder(textures(rng))
-    b.panel("setts", at(-14, 0, 18), [28, 0, 0], [0, 0, -11.5], tile=1.5, step=0.4)
-    b.panel("asphalt", at(-14, -0.12, 6.5), [28, 0, 0], [0, 0, -8.5], tile=2.0, step=0.4)
-    b.box("stone", at(0, -0.05, 6.5), (28, 0.16, 0.18), tile=0.8, step=0.3)
+def row_of_houses(b: Builder, rng: Rng) -> None:
+    """Fronts across the view with an alley between two of them, and perhaps wings at the sides."""
     gap = rng.uniform(-3.0, 3.0)  # an alley with a house at its end
     x, depth = -11.0, rng.uniform(10.0, 11.0)
     while x < 11:
@@ -274,6 +285,15 @@ def build(rng: Rng) -> Builder:
                 (at(edge, 0, near), [0, 0, 1.0]) if side < 0 else (at(edge, 0, far), [0, 0, -1.0])
             )
             house(b, rng, start, np.asarray(along, np.float32), far - near, rng.uniform(4.4, 5.6))
+
+
+def build(rng: Rng) -> Builder:
+    """A street corner, laid out at random: metres, camera at EYE above the ground."""
+    b = Builder(textures(rng))
+    b.panel("setts", at(-14, 0, 18), [28, 0, 0], [0, 0, -11.5], tile=1.5, step=0.4)
+    b.panel("asphalt", at(-14, -0.12, 6.5), [28, 0, 0], [0, 0, -8.5], tile=2.0, step=0.4)
+    b.box("stone", at(0, -0.05, 6.5), (28, 0.16, 0.18), tile=0.8, step=0.3)
+    row_of_houses(b, rng)
     slots = list(rng.permutation(np.linspace(-3.6, 3.6, 7)))
     for x in slots[:2]:
         tree(b, rng, at(x, 0, rng.uniform(6.8, 8.5)), rng.uniform(3.6, 4.8))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from pipeline.drops import places_textures as tx
@@ -9,6 +11,7 @@ from pipeline.drops.places_parts import Array, Builder, Cell, offset, turn
 
 Rng = np.random.Generator
 EYE = 1.6  # height of the camera above the ground, metres
+FRUITS = ((0.95, 0.45, 0.1), (0.8, 0.15, 0.12), (0.55, 0.75, 0.2), (0.95, 0.8, 0.25))
 
 
 def at(x: float, h: float, z: float) -> Array:
@@ -120,6 +123,39 @@ def bench(b: Builder, rng: Rng, foot: Array, yaw: float) -> None:
         b.box("metal", foot + r @ np.array([x, -0.65, 0.3]), (0.05, 0.5, 0.04), yaw=yaw)
 
 
+def fruit_crate(
+    b: Builder,
+    rng: Rng,
+    place: Callable[[float, float, float], Array],
+    x: float,
+    width: float,
+    yaw: float,
+) -> None:
+    """A crate of one kind of fruit on a stall's table; `place` turns (along, up, away) to the world."""
+    b.box(
+        "wood",
+        place(x, 0.9, -0.15),
+        (width - 0.06, 0.18, 0.6),
+        yaw=yaw,
+        tile=0.3,
+        tint=(1.2, 1.1, 0.9),
+    )
+    fruit = np.asarray(FRUITS)[rng.integers(0, len(FRUITS))]
+    for _ in range(14):
+        spot = place(
+            x + rng.uniform(-0.5, 0.5) * (width - 0.15),
+            1.01 + rng.uniform(0, 0.06),
+            -0.15 + rng.uniform(-0.24, 0.24),
+        )
+        b.ball(
+            "paint",
+            spot,
+            np.full(3, rng.uniform(0.05, 0.075)),
+            sides=8,
+            tint=fruit * rng.uniform(0.8, 1.15),
+        )
+
+
 def stall(b: Builder, rng: Rng, foot: Array, yaw: float) -> None:
     """Market stall: striped roof on poles, crates of fruit on a table, a lettered board."""
     r, w, d = turn(yaw), rng.uniform(1.8, 2.4), 1.2
@@ -167,31 +203,7 @@ def stall(b: Builder, rng: Rng, foot: Array, yaw: float) -> None:
         tint=(0.7, 0.65, 0.6),
     )
     for k in range(4):
-        x = -w / 2 + w * (k + 0.5) / 4
-        b.box(
-            "wood",
-            p(x, 0.9, -0.15),
-            (w / 4 - 0.06, 0.18, 0.6),
-            yaw=yaw,
-            tile=0.3,
-            tint=(1.2, 1.1, 0.9),
-        )
-        fruit = np.asarray(
-            ((0.95, 0.45, 0.1), (0.8, 0.15, 0.12), (0.55, 0.75, 0.2), (0.95, 0.8, 0.25))
-        )[rng.integers(0, 4)]
-        for _ in range(14):
-            spot = p(
-                x + rng.uniform(-0.5, 0.5) * (w / 4 - 0.15),
-                1.01 + rng.uniform(0, 0.06),
-                -0.15 + rng.uniform(-0.24, 0.24),
-            )
-            b.ball(
-                "paint",
-                spot,
-                np.full(3, rng.uniform(0.05, 0.075)),
-                sides=8,
-                tint=fruit * rng.uniform(0.8, 1.15),
-            )
+        fruit_crate(b, rng, p, -w / 2 + w * (k + 0.5) / 4, w / 4, yaw)
 
 
 def planter(b: Builder, rng: Rng, foot: Array, size: float = 0.5, leaves: int = 160) -> None:
