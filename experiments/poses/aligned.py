@@ -1,21 +1,21 @@
-"""What better poses would give: estimated ones aligned to the photos through a briefly fitted field.
+"""What poses are worth: true ones, those in a scene's artifacts, and these aligned once more.
 
     python -m experiments.poses.aligned data/demo --photos clean
     python -m experiments.poses.aligned data/harbour-move --photos rainy --brief 600 --steps 1500
 
-A scene is a folder that `synthesize` made, with its poses in `artifacts/<scene>/poses`; photos are
-halved. A field is fitted for `--brief` steps; then each camera is moved and turned until the field's
-rendering lies on its photo (Gauss and Newton on the grey values: Lucas and Kanade's alignment through
-the rendered depth), three times; then a field is fitted anew. Behind the words *held out*: PSNR of the
-held-out views against the clean references at their estimated poses, and at poses aligned to the fitted
-field with their own photo's dry pixels. *tracks*: how far, in pixels of the whole photo, exact
-tracks of points of the scene stay from any points that these cameras could see: what in the poses no
-other world explains.
+A scene is a folder that `synthesize` made, with its poses in `artifacts/<scene>/poses` (of a run with
+`poses.align_rounds: 0`, to see what the features alone are worth); photos are halved. A field is fitted for
+`--brief` steps and each camera aligned to its photo through it (`pipeline.field.align`); then a field is
+fitted anew. Behind the words *held out*: PSNR of the held-out views against the clean references at their
+estimated poses, and at poses aligned to the fitted field with their own photo's dry pixels. *tracks*: how
+far, in pixels of the whole photo, exact tracks of points of the scene stay from any points that these
+cameras could see: what in the poses no other world explains.
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ import torch
 import yaml
 
 from benchmarks.quality import FIELD, ROOT, TRUE_COVERAGE, Scene, load
+from pipeline.field.align import aligned
 from pipeline.field.buffer import PosedPhoto, RayBuffer
 from pipeline.field.fit import fit
 from pipeline.field.model import build_around
@@ -32,42 +33,7 @@ from pipeline.field.render import RenderedView, render_view
 from pipeline.io.transforms import View
 
 Poses = dict[str, np.ndarray]
-ALIGNMENTS, RIM, BLUR = 3, 3, 0.7
-
-
-def moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """``pose`` (4, 4) followed by a small motion: metres along and radians about its axes (6,)."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = cv2.Rodrigues(twist[3:])[0], twist[:3]
-    return out @ pose
-
-
-def aligned(
-    photo: np.ndarray, keep_mask: np.ndarray, seen: RenderedView, intrinsics: Any, pose: np.ndarray
-) -> np.ndarray:
-    """``pose`` after one step that lays the rendering ``seen`` there on the ``photo``.
-
-    A surface at x in the camera's frame moves by v + w x x, its pixel by the projection's derivative
-    of that, the photo's value by its gradient along it. Cauchy weights; the pictures' rim is left out.
-    """
-    fx, fy, cx, cy, _ = intrinsics
-    rows, columns = np.indices(seen.depth.shape)
-    x, y, inverse = (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, 1.0 / seen.depth
-    unit = float(np.median(seen.depth))
-    none, inverse = np.zeros_like(x), inverse * unit
-    along_x = fx * np.stack([inverse, none, -x * inverse, -x * y, 1 + x * x, -y], -1)
-    along_y = fy * np.stack([none, inverse, -y * inverse, -(1 + y * y), x * y, x], -1)
-    a, b = (cv2.GaussianBlur(one, (0, 0), BLUR) for one in (photo, seen.rgb))
-    slope_y, slope_x = np.gradient(0.5 * (a + b), axis=(0, 1))
-    jacobian = slope_x[..., None] * along_x[:, :, None] + slope_y[..., None] * along_y[:, :, None]
-    use = cv2.erode(keep_mask.astype(np.uint8), np.ones((3, 3))) > 0
-    use[:RIM], use[-RIM:], use[:, :RIM], use[:, -RIM:] = False, False, False, False
-    j, error = jacobian[use].reshape(-1, 6), (b - a)[use].ravel()
-    weight = 1.0 / (1.0 + (error / (3.0 * np.median(np.abs(error)) + 1e-6)) ** 2)
-    weighted = j * weight[:, None]
-    twist = np.linalg.solve(weighted.T @ j + 1e-9 * np.eye(6), weighted.T @ error)
-    twist[:3] *= unit
-    return moved(pose, twist)
+ALIGNMENTS = 3
 
 
 def projected(points: np.ndarray, view: View, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,12 +116,11 @@ class Half:
     def aligned(self, seen: Any, poses: Poses, stems: list[str]) -> Poses:
         """``poses``, those of ``stems`` aligned to the rendering ``seen``."""
         out = dict(poses)
-        for _ in range(ALIGNMENTS):
-            for s in stems:
-                camera = _halved_view(self.estimated[s], out[s]).intrinsics
-                out[s] = aligned(
-                    self.photos[s], self.keep_masks[s], seen(s, out[s]), camera, out[s]
-                )
+        for s in stems:
+            camera = _halved_view(self.estimated[s], out[s]).intrinsics
+            out[s] = aligned(
+                self.photos[s], self.keep_masks[s], out[s], camera, partial(seen, s), ALIGNMENTS
+            )
         return out
 
     def psnr(self, seen: Any, poses: Poses) -> float:

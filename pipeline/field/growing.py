@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from pipeline.field.align import aligned
 from pipeline.field.buffer import RayBuffer, photos_to_fit
 from pipeline.field.fit import fit
 from pipeline.field.model import build_around
-from pipeline.field.render import RenderedView, render_view
+from pipeline.field.render import RenderedView, render_view, scaled_camera
 from pipeline.field.visibility import Witness, seen_by_others
+from pipeline.io.images import resized
 from pipeline.io.posed import PosedImage
+
+FAR_FACTOR = 2.0  # the world ends this far beyond the farthest sparse point
+ALIGN_RAYS = 1024  # per step of the fits that cameras are aligned to
+ALIGN_STEPS = 2  # of each camera between two fits
+
+Each = Callable[[Callable[..., Any], Mapping[str, tuple[Any, ...]]], dict[str, Any]]
+
+
+def scaled_image(image: PosedImage, scale: float) -> PosedImage:
+    """The image and its camera with ``scale`` times the pixels; one that is partly covered is not kept."""
+    view = image.view
+    (fx, fy, cx, cy, _), size = scaled_camera(view.intrinsics, (view.width, view.height), scale)
+    smaller = replace(view, fx=fx, fy=fy, cx=cx, cy=cy, width=size[0], height=size[1])
+    keep_mask = resized(image.keep_mask.astype(np.float32), size) > 0.999
+    return replace(image, view=smaller, rgb=resized(image.rgb, size), keep_mask=keep_mask)
 
 
 class GrowingField:
@@ -49,13 +67,13 @@ class GrowingField:
         )
         self.psnr.append(record.rows[-1][2])
 
-    def view(self, image: PosedImage) -> RenderedView:
-        """What the field shows at an image's pose."""
+    def view(self, image: PosedImage, cam_from_world: np.ndarray | None = None) -> RenderedView:
+        """What the field shows at an image's pose, or with its camera at another one."""
         view = image.view
         size = (view.width, view.height)
         return render_view(
             self.field,
-            view.cam_from_world,
+            view.cam_from_world if cam_from_world is None else cam_from_world,
             view.intrinsics,
             size,
             self.near,
@@ -85,3 +103,46 @@ class GrowingField:
             for name, image in zip(names, fitted, strict=True)
         ]
         return {name: seen_by_others(index, witnesses, fewest) for index, name in enumerate(names)}
+
+    def aligned(self, image: PosedImage, steps: int) -> np.ndarray:
+        """The pose (4, 4) at which the field lies best on the image's uncovered pixels."""
+        return aligned(
+            image.rgb,
+            image.keep_mask,
+            image.view.cam_from_world,
+            image.view.intrinsics,
+            lambda cam_from_world: self.view(image, cam_from_world),
+            steps,
+        )
+
+    def place(self, poses: Mapping[str, np.ndarray]) -> None:
+        """Further fits go by these poses (by name) of the images, held-out ones included."""
+        self.images = [
+            replace(image, view=replace(image.view, cam_from_world=poses[image.record.name]))
+            for image in self.images
+        ]
+
+
+def aligned_poses(
+    images: Sequence[PosedImage],
+    each: Each,
+    fits: Sequence[int],
+    scale: float,
+    *,
+    seed: int,
+    device: str,
+    threads: int,
+) -> dict[str, np.ndarray]:
+    """The images' poses (4, 4) by name, moved so that one field explains their dry pixels best.
+
+    A field is fitted for ``fits[0]`` steps, every camera moved onto its photo (:func:`aligned`), the field
+    fitted on for ``fits[1]`` steps, and so forth; at ``scale`` times the photos' size. ``each`` maps a
+    function over tasks by name. Held-out images are moved too, but never fitted.
+    """
+    smaller = [scaled_image(image, scale) for image in images]
+    field = GrowingField(smaller, FAR_FACTOR, seed, device)
+    drop_masks = {image.record.name: ~image.keep_mask for image in smaller}
+    for steps in fits:
+        field.fit(drop_masks, steps, ALIGN_RAYS, threads)
+        field.place(each(field.aligned, {i.record.name: (i, ALIGN_STEPS) for i in field.images}))
+    return {image.record.name: image.view.cam_from_world for image in field.images}

@@ -62,4 +62,6 @@ def poses_note(account: Mapping[str, Any], total: int) -> str:
     if "points" in account and "reprojection_px" in account:
         error = account["reprojection_px"]
         note += f"; {account['points']} points, {error:.2f} px off on average"
+    if account.get("aligned"):
+        note += "; the cameras are aligned to the photos' dry pixels"
     return note + "."

@@ -10,6 +10,7 @@ from pipeline.sfm.database import Progress
 from pipeline.sfm.export import read_sparse, sparse_points, write_straight
 from pipeline.sfm.given import read_colmap, triangulate
 from pipeline.sfm.model import write_sparse
+from pipeline.sfm.placing import with_poses
 from pipeline.sfm.reconstruct import reconstruct
 from pipeline.sfm.result import (
     Attempt,
@@ -33,6 +34,7 @@ __all__ = [
     "reconstruct",
     "sparse_points",
     "triangulate",
+    "with_poses",
     "write_sparse",
     "write_straight",
 ]

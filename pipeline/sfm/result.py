@@ -115,6 +115,7 @@ class Reconstructed:
     attempts: list[Attempt]
     settings: Settings
     model: Any = field(repr=False)  # the pycolmap.Reconstruction, for write_sparse only
+    aligned: bool = False  # whether the cameras were moved onto the photos, see `with_poses`
 
 
 def account(found: Reconstructed, total: int) -> dict[str, Any]:
@@ -131,6 +132,7 @@ def account(found: Reconstructed, total: int) -> dict[str, Any]:
         "points": len(found.points_xyz),
         "model_sizes": found.model_sizes,
         "focal_px": round(float(np.median([view.fx for view in found.views.values()])), 4),
+        "aligned": found.aligned,
         "masked": found.settings.masked,
         "stationary_dropped": found.settings.still,
         "tried": [
