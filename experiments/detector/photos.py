@@ -1,8 +1,9 @@
 """Fetches the clean photographs that the shipped weights were trained on, from Debian packages.
 
-`python -m experiments.detector.photos OUT` writes OUT/train and OUT/unseen (kept for scoring), JPEG,
-longest side 1600. They are pictures of Debian's main archive, whose licences allow all uses of the
-project; they are not part of it. Needs a Debian machine (`apt-get download`, `dpkg-deb`).
+`python -m experiments.detector.photos OUT` writes OUT/train, OUT/unseen (kept for scoring: painted on,
+and dry) and OUT/dry (kept for scoring, dry only), JPEG, longest side 1600. They are pictures of Debian's
+main archive, whose licences allow all uses of the project; they are not part of it. Needs a Debian
+machine (`apt-get download`, `dpkg-deb`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ OPENCV = "usr/share/doc/opencv-doc/examples"
 # Which pictures of which package; the names are paths inside it, without their common beginning.
 PHOTOS: dict[str, tuple[str, tuple[str, ...]]] = {
     "lomiri-wallpapers-16.04": (BACKGROUNDS, (
-        "Bridge_by_Sander_Klootwijk.jpg", "Dragonfly_by_Bolly.jpg", "Picture_1A_by_freespace.jpg",
+        "Bridge_by_Sander_Klootwijk.jpg", "Dragonfly_by_Bolly.jpg", "Picture_0B_by_freespace.jpg",
+        "Picture_1A_by_freespace.jpg",
         "Wine_by_Jakkub_Mede.jpg", "aitzgorri_by_Aitzol_Berasategi.jpg", "free_by_Peter_Nerlich.jpg",
         "friends_by_Aitzol_Berasategi.jpg", "greentock_by_Peter_Nerlich.jpg",
         "life_by_Aitzol_Berasategi.jpg", "picosdeeuropa_by_Aitzol_Berasategi.jpg",
@@ -28,7 +30,8 @@ PHOTOS: dict[str, tuple[str, tuple[str, ...]]] = {
     )),
     "lomiri-wallpapers-20.04": (BACKGROUNDS, ("Kleiber_by_Lukas_Baubkus.jpg",)),
     "mate-backgrounds": (f"{BACKGROUNDS}/mate/nature", (
-        "Dune.jpg", "FreshFlower.jpg", "Garden.jpg", "GreenMeadow.jpg", "LadyBird.jpg", "Storm.jpg",
+        "Blinds.jpg", "Dune.jpg", "FreshFlower.jpg", "Garden.jpg", "GreenMeadow.jpg", "LadyBird.jpg",
+        "Storm.jpg",
         "TwoWings.jpg", "Wood.jpg", "YellowFlower.jpg",
     )),
     "plasma-workspace-wallpapers": ("", tuple(PLASMA.format(name) for name in (
@@ -41,6 +44,9 @@ PHOTOS: dict[str, tuple[str, tuple[str, ...]]] = {
         "data/graf1.png", "data/home.jpg", "data/left.jpg", "data/leuvenA.jpg",
         "data/rubberwhale1.png", "data/smarties.png", "data/squirrel_cls.jpg", "data/stuff.jpg",
         "data/apple.jpg", "data/licenseplate_motion.jpg",
+        "data/aero3.jpg", "data/baboon.jpg", "data/basketball1.png", "data/box_in_scene.png",
+        "data/ela_original.jpg", "data/messi5.jpg", "data/orange.jpg",
+        "data/text_defocus.jpg", "data/text_motion.jpg",
         "text/scenetext01.jpg", "text/scenetext02.jpg", "text/scenetext03.jpg",
         "text/scenetext04.jpg", "text/scenetext05.jpg", "text/scenetext06.jpg",
         "text/scenetext_segmented_word01.jpg", "text/scenetext_segmented_word02.jpg",
@@ -51,6 +57,9 @@ PHOTOS: dict[str, tuple[str, tuple[str, ...]]] = {
 # Never trained on: a street, a house, signs, a lawn with a barrier, mountains, an animal, a forest.
 UNSEEN = ("leuvenA", "home", "scenetext01", "scenetext05", "picosdeeuropa_by_Aitzol_Berasategi",
           "squirrel_cls", "summer_1am", "Garden")  # fmt: skip
+# Never trained or painted on: blurred grounds, text out of focus, a crowd, a leaf against the light, ...
+DRY = ("Picture_0B_by_freespace", "Blinds", "aero3", "baboon", "basketball1", "box_in_scene",
+       "ela_original", "messi5", "orange", "text_defocus", "text_motion")  # fmt: skip
 LONGEST = 1600
 
 
@@ -74,7 +83,8 @@ def _keep(source: Path, package: str, out: Path) -> None:
     factor = LONGEST / max(photo.shape[:2])
     if factor < 1:
         photo = cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    target = out / ("unseen" if stem in UNSEEN else "train") / f"{stem}.jpg"
+    kind = "unseen" if stem in UNSEEN else "dry" if stem in DRY else "train"
+    target = out / kind / f"{stem}.jpg"
     target.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(target), photo, [cv2.IMWRITE_JPEG_QUALITY, 95])
     print(f"{package}: {target}")

@@ -1,7 +1,8 @@
 """Scores detectors per test set: precision, recall, F1 and IoU at a threshold, the best, and AP.
 
 `python -m experiments.detector.score unet:weights/unet.safetensors --threshold 0.3 \\
-    --scenes data/demo --painted artifacts/pools/photos/unseen --pairs ../shared/real/qian`
+    --scenes data/demo --painted artifacts/pools/photos/unseen --pairs ../shared/real/qian \\
+    --rendered artifacts/pools/rendered_unseen --dry artifacts/pools/photos/unseen`
 
 A scene is a folder with photos and truth/coverage/, as the stage synthesize makes it; it is scored
 per view, by equation 5 (view or mean map) and by the mean map alone. A pixel is wet where the true
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,14 +24,22 @@ import numpy as np
 import torch
 
 from pipeline.attention.inference import attend
-from pipeline.attention.pools import CHUNK, list_pictures, paint_chunk, painted_name, read_chunk
+from pipeline.attention.pools import (
+    CHUNK,
+    list_pictures,
+    paint_chunk,
+    painted_name,
+    read_chunk,
+    read_rendered,
+)  # fmt: skip
 from pipeline.attention.samples import VISIBLE_COVERAGE, coverage_of_pair
 from pipeline.attention.weights import Detector, load_network
-from pipeline.io.images import PHOTO_SUFFIXES, read_photo
+from pipeline.io.images import PHOTO_SUFFIXES, read_photo, shrink
 
 BINS = 1000
 SHIFT = 8
 SURELY_DRY = 10 / 255
+DRY_SIZE = 800
 Case = tuple[str, np.ndarray, np.ndarray]  # name, photo (H,W,3) in [0,1], wet (H,W)
 
 
@@ -82,6 +92,12 @@ def painted_cases(folder: Path, scratch: Path, count: int, difference: bool) -> 
         yield f"{k:02d}", _unit(rainy), wet
 
 
+def rendered_cases(folder: Path) -> Iterator[Case]:
+    """Pictures of a folder with rainy/, clean/ and coverage/."""
+    for k, (rainy, _, cover) in enumerate(zip(*read_rendered(folder), strict=True)):
+        yield f"{k:02d}", _unit(rainy), cover / 255 > VISIBLE_COVERAGE
+
+
 def pair_cases(folder: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Photo pairs, the clean photo shifted to match: as a Case, and where the truth is sure."""
     for path in sorted(folder.glob("*_rain.png")):
@@ -120,6 +136,8 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="every n-th photo of a scene")
     parser.add_argument("--painted", type=Path, help="folder of photos never trained on")
     parser.add_argument("--pairs", type=Path, help="folder of photo pairs")
+    parser.add_argument("--rendered", type=Path, help="folder of renders never trained on")
+    parser.add_argument("--dry", nargs="*", type=Path, default=[], help="folders of dry photos")
     parser.add_argument("--scales", nargs="+", type=float, default=[1.0])
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--scratch", type=Path, default=Path("artifacts/.work/demo/train_detector"))
@@ -131,15 +149,33 @@ def main() -> None:
         network = load_network(Path(file), model).for_inference()
         for name, tally in tallies(network, flags):
             figures = tally.row(flags.threshold)
-            print(f"{name:40s} " + " ".join(f"{v:5.3f}" for v in figures.values()))
+            print(f"{name:40s} " + " ".join(f"{v:5.3f}" for v in figures.values()), flush=True)
+        for folder in flags.dry:
+            shares = dry_shares(network, folder, flags)
+            worst = ", ".join(
+                f"{k} {shares[k]:.1%}" for k in sorted(shares, key=lambda k: -shares[k])[:3]
+            )
+            mean = np.mean(list(shares.values()))
+            print(f"{folder}, dry ({len(shares)}): {mean:.2%} marked; {worst}", flush=True)
+
+
+def _mapped(network: Detector, photo: np.ndarray, flags: argparse.Namespace) -> np.ndarray:
+    return attend(network, photo, scales=flags.scales, steps=flags.steps)
+
+
+def dry_shares(network: Detector, folder: Path, flags: argparse.Namespace) -> dict[str, float]:
+    """The share of every dry photo that is marked, by the photo's name."""
+    shares: dict[str, float] = {}
+    for path in list_pictures(folder)[:: flags.every]:
+        photo = _unit(shrink(read_photo(path)[0], DRY_SIZE))
+        shares[path.stem] = float((_mapped(network, photo, flags) >= flags.threshold).mean())
+    return shares
 
 
 def tallies(network: Detector, flags: argparse.Namespace) -> Iterator[tuple[str, Tally]]:
     """The tally of every test set that was asked for."""
 
-    def mapped(photo: np.ndarray) -> np.ndarray:
-        return attend(network, photo, scales=flags.scales, steps=flags.steps)
-
+    mapped = partial(_mapped, network, flags=flags)
     for scene in flags.scenes:
         cases = scene_cases(scene)[:: flags.every]
         maps = [mapped(photo) for _, photo, _ in cases]
@@ -157,6 +193,11 @@ def tallies(network: Detector, flags: argparse.Namespace) -> Iterator[tuple[str,
             for _, photo, wet in painted_cases(flags.painted, flags.scratch, 40, difference):
                 tally.add(mapped(photo), wet)
             yield f"painted, {'difference > 30' if difference else 'coverage > 0.05'}", tally
+    if flags.rendered:
+        tally = Tally()
+        for _, photo, wet in rendered_cases(flags.rendered):
+            tally.add(mapped(photo), wet)
+        yield f"{flags.rendered.name}, per view", tally
     if flags.pairs:
         together, surely = Tally(), Tally()
         for name, photo, wet, sure in pair_cases(flags.pairs):
