@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
+import math
 from typing import Annotated, Literal
 
 import torch
@@ -13,12 +11,15 @@ from tqdm import tqdm
 
 from pipeline.attention import pools
 from pipeline.attention.samples import Pool
-from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit
-from pipeline.attention.weights import DETECTORS, load_network, save_network
-from pipeline.io.atomic import write_bytes, write_csv
+from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit, score
+from pipeline.attention.weights import DETECTORS, averaged, load_network, load_others, save_network
+from pipeline.io import checkpoints
+from pipeline.io.atomic import write_csv
 from pipeline.io.paths import ScenePaths
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
+
+TRAINER = {"seed", "clean_share", "lures", "bfloat16"}
 
 
 class PhaseParams(Section):
@@ -45,48 +46,47 @@ class Params(Section):
     photo_pairs: list[str]
     shares: tuple[float, float, float]
     clean_share: Annotated[float, Field(ge=0, le=1)]
+    lures: Annotated[float, Field(ge=0, le=1)]
     validation: Annotated[int, Field(ge=1, le=pools.CHUNK)]
     validation_photos: str
     validation_rendered: list[str]
     validate_every: Annotated[int, Field(ge=1)]
     bfloat16: bool
     phases: Annotated[list[PhaseParams], Field(min_length=1)]
+    average: dict[str, Annotated[float, Field(gt=0, lt=1)]]
 
 
 def main(job: Job, params: Params) -> str:
     """Writes the weights, and beside them the validation curve as CSV."""
     start = job.resolve(params.start) if params.start else None
-    network = (load_network(start, params.model, named_by="train_detector.start") if start
-               else DETECTORS[params.model]())  # fmt: skip
-    if start is None:
+    if start:
+        network = load_network(start, params.model, named_by="train_detector.start")
+    else:
+        network = DETECTORS[params.model]()
         network.initialise(params.seed)
     training, validation = _training(job, params), _validation(job, params)
     phases = [Phase(**phase.model_dump()) for phase in params.phases]
     network.to(job.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    trainer = Trainer(network, training, phases, seed=params.seed,
-                      clean_share=params.clean_share, bfloat16=params.bfloat16)  # fmt: skip
-    told = json.dumps(params.model_dump(exclude={"weights"}), sort_keys=True).encode()
-    key = hashlib.sha256(told + (start.read_bytes() if start else b"")).hexdigest()[:16]
+    trainer = Trainer(network, training, phases, **params.model_dump(include=TRAINER))
+    others = load_others({job.resolve(p): s for p, s in params.average.items()}, params.model)
+    key = checkpoints.training_key(params.model_dump(exclude={"weights", "average"}), start)
     checkpoint = job.paths.work("train_detector") / f"{key}.pt"
-    rows: list[list[float | str]] = []
-    if checkpoint.is_file():
-        saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        trainer.restore(saved["trainer"])
-        rows = saved["rows"]
+    rows = checkpoints.load_checkpoint(checkpoint, trainer)
     with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:
 
         def on_score(done: int, steps: int, loss: float, found: dict[str, Score]) -> None:
             bar.update(done - bar.n)
             rows.extend(curve_rows(done, steps, loss, found))
             bar.write(" ".join(f"{name} F1 {each.f1:.3f}" for name, each in found.items()))
-            buffer = io.BytesIO()
-            torch.save({"trainer": trainer.state(), "rows": rows}, buffer)
-            write_bytes(checkpoint, buffer.getvalue())
+            checkpoints.save_checkpoint(checkpoint, trainer, rows)
 
-        average = fit(trainer, validate_every=params.validate_every, validation=validation,
+        trained = fit(trainer, validate_every=params.validate_every, validation=validation,
                       on_score=on_score)  # fmt: skip
-    target = job.resolve(params.weights)
-    save_network(target, average)
+    if others:
+        trained = averaged(trained.cpu(), others)
+        found = {name: score(trained, pool, phases[-1].steps) for name, pool in validation.items()}
+        rows.extend(curve_rows(trainer.done, phases[-1].steps, math.nan, found))
+    save_network(target := job.resolve(params.weights), trained)
     write_csv(target.with_suffix(".csv"), CURVE, rows)
     return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"
 

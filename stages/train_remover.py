@@ -13,6 +13,7 @@ from tqdm import tqdm
 from pipeline.attention import pools
 from pipeline.attention.training import attention_loss
 from pipeline.attention.weights import load_network
+from pipeline.io import checkpoints
 from pipeline.io.atomic import write_csv
 from pipeline.parallel import map_named
 from pipeline.removal import clips, store
@@ -63,17 +64,16 @@ def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
     unseen = _painted(job, room, params.validation_photos, params.seed + 1, params.validation)
     others = {"attgan", "quan", "wen"} - {method}
     files = [job.resolve(path) if path else None for path in (params.attention, params.perceptual)]
-    key = store.training_key(params.model_dump(exclude={"folder", *others}), *files)
-    work = job.paths.work("train_remover")
-    checkpoint = work / f"{method}-{key}.pt"
-    rows = store.load_checkpoint(checkpoint, trainer)
+    key = checkpoints.training_key(params.model_dump(exclude={"folder", *others}), *files)
+    checkpoint = (work := job.paths.work("train_remover")) / f"{method}-{key}.pt"
+    rows = checkpoints.load_checkpoint(checkpoint, trainer)
     with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:
 
         def on_score(loss: float, found: dict[str, tuple[float, float]]) -> None:
             bar.update(trainer.done - bar.n)
             rows.extend(curve_rows(trainer.done, loss, found))
             bar.write(" ".join(f"{each} {a:.2f} -> {b:.2f} dB" for each, (a, b) in found.items()))
-            store.save_checkpoint(checkpoint, trainer, rows)
+            checkpoints.save_checkpoint(checkpoint, trainer, rows)
             store.save_remover(work / f"{method}.safetensors", trainer.average, method)
 
         average = fit(trainer, params.validate_every, {name: Pairs(*unseen)}, on_score)

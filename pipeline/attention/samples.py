@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.attention.lures import lure
+
 # Any pixel with more water than this counts as a drop: faintly wet pixels spoil a fit as well.
 VISIBLE_COVERAGE = 0.05
 # |rainy - clean| beyond this is a drop in a pair of photos, as in Qian et al. (CVPR 2018).
@@ -60,16 +62,18 @@ def coverage_of_pair(
 
 
 def draw_batch(
-    pools: Sequence[Pool], rng: np.random.Generator, batch: int, crop: int, clean_share: float
-) -> tuple[Tensor, Tensor, Tensor]:
+    pools: Sequence[Pool], rng: np.random.Generator, batch: int, crop: int, clean_share: float,
+    lures: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Augmented crops: (N,3,crop,crop) BGR in [0,1], (N,1,crop,crop) coverage and weight.
 
-    clean_share: the part of the crops that show no drop at all. The weight in the loss is 1, but
+    clean_share: the part of the crops that show no drop at all; lures: the part of those that are made to
+    look wet, see `lure`. The weight in the loss is 1, but
     small where there is water that changes nothing.
     """
     shares = np.array([pool.share for pool in pools], np.float64)
     drawn = [
-        _draw(pools[rng.choice(len(pools), p=shares / shares.sum())], rng, crop, clean_share)
+        _draw(pools[rng.choice(len(pools), p=shares / shares.sum())], rng, crop, clean_share, lures)
         for _ in range(batch)
     ]
     images = np.stack([image[..., ::-1].transpose(2, 0, 1) for image, _, _ in drawn])
@@ -83,7 +87,7 @@ def draw_batch(
 
 
 def _draw(
-    pool: Pool, rng: np.random.Generator, crop: int, clean_share: float
+    pool: Pool, rng: np.random.Generator, crop: int, clean_share: float, lures: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     index = int(rng.integers(len(pool.rainy)))
     dry = len(pool.clean) > 0 and rng.random() < clean_share
@@ -110,6 +114,8 @@ def _draw(
         )
     if rng.random() < 0.5:
         image, part, weight = image[:, ::-1], part[:, ::-1], weight[:, ::-1]
+    if dry and lures > 0 and rng.random() < lures:
+        image = lure(image, rng)
     image = _photographed(image, rng)
     return image, np.ascontiguousarray(part), np.ascontiguousarray(weight)
 

@@ -88,10 +88,11 @@ class Trainer:
 
     def __init__(
         self, network: Detector, pools: Sequence[Pool], phases: Sequence[Phase],
-        *, seed: int, clean_share: float, bfloat16: bool = False,
+        *, seed: int, clean_share: float, lures: float = 0.0, bfloat16: bool = False,
     ) -> None:  # fmt: skip
         self.network, self.pools, self.phases = network, pools, phases
-        self.seed, self.clean_share, self.bfloat16 = seed, clean_share, bfloat16
+        self.seed, self.bfloat16 = seed, bfloat16
+        self.clean_share, self.lures = clean_share, lures
         self.phase = self.iteration = self.seen = self.done = 0
         self.average = copy.deepcopy(network).eval()
         self._begin_phase()
@@ -129,7 +130,7 @@ class Trainer:
         """One iteration; its loss."""
         phase = self.phases[self.phase]
         rng = np.random.default_rng([self.seed, self.phase, self.iteration])
-        drawn = draw_batch(self.pools, rng, phase.batch, phase.crop, self.clean_share)
+        drawn = draw_batch(self.pools, rng, phase.batch, phase.crop, self.clean_share, self.lures)
         self.network.train()
         loss = self._loss(*drawn, phase.steps)
         for optimiser in self.optimisers:

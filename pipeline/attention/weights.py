@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from pipeline.attention.network import AttentiveRecurrentNet
@@ -47,6 +50,38 @@ def load_network(
     network = DETECTORS[model]()
     fill(network, _counts(network) | state, str(path))
     return network
+
+
+def load_others(
+    shares: Mapping[Path, float], model: str, named_by: str = "train_detector.average"
+) -> list[tuple[Detector, float]]:
+    """The networks to average another one with, from their files, and the share of each.
+
+    Raises UserError as `load_network` does, and where the shares leave nothing to that other one.
+    """
+    if sum(shares.values()) >= 1:
+        raise UserError(
+            f"The shares in {named_by} add up to 1 or more.", "Less leaves some to the trained one."
+        )
+    return [(load_network(path, model, named_by), share) for path, share in shares.items()]
+
+
+def averaged(network: Detector, others: Sequence[tuple[Detector, float]]) -> Detector:
+    """A network whose every number is the mean of those of the networks given, by shares.
+
+    others: networks of the same kind, each with its share in [0,1]; `network` has what is left of 1.
+    Where one was trained on from the other, the mean keeps most of what each has learnt. Source: Wortsman
+    et al., Model soups, ICML 2022; https://doi.org/10.48550/arXiv.2203.05482.
+    """
+    left = 1 - sum(share for _, share in others)
+    found = copy.deepcopy(network)
+    states = [(each.state_dict(), share) for each, share in others]
+    with torch.no_grad():
+        for name, value in found.state_dict().items():
+            if value.is_floating_point():
+                mean = left * value.double() + sum(s * state[name].double() for state, s in states)
+                value.copy_(mean)
+    return found
 
 
 def _counts(network: Detector) -> dict[str, Tensor]:

@@ -8,9 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from pipeline.attention import pools
-from pipeline.attention.weights import load_network
+from pipeline.attention.weights import DETECTORS, load_network, save_network
+from pipeline.errors import UserError
 from pipeline.io.images import write_image
 from pipeline.stage import Job
 from stages import train_detector
@@ -29,12 +31,14 @@ PARAMS = Params(
     photo_pairs=["pairs"],
     shares=(0.5, 0.5, 0.5),
     clean_share=0.1,
+    lures=0.5,
     validation=2,
     validation_photos="",
     validation_rendered=["rendered"],
     validate_every=2,
     bfloat16=False,
     phases=PHASES,
+    average={},
 )
 
 
@@ -100,6 +104,29 @@ def test_weights_and_curve_and_the_same_after_an_interruption(
         == f"unet.safetensors: best F1 {float(rows[-1]['f1'])} on painted pictures it was not trained on"
     )
     assert load_network(root / "w/unet.safetensors", "unet").reach() > 0
+
+
+def test_trained_weights_are_averaged_with_others_and_scored_anew(root: Path) -> None:
+    job = Job(root, "made", None, "cpu", None, False)
+    main(job, PARAMS)
+    trained = load_network(root / "w/unet.safetensors", "unet").state_dict()
+    other = DETECTORS["unet"]()
+    other.initialise(9)
+    save_network(root / "other.safetensors", other)
+    closing = main(job, PARAMS.model_copy(update={"average": {"other.safetensors": 0.25}}))
+    mixed = load_network(root / "w/unet.safetensors", "unet").state_dict()
+    for name, value in other.state_dict().items():
+        if value.is_floating_point():
+            torch.testing.assert_close(mixed[name], 0.75 * trained[name] + 0.25 * value)
+    rows = list(csv.DictReader((root / "w/unet.csv").read_text().splitlines()))
+    assert [row["loss"] for row in rows[-2:]] == ["nan", "nan"]  # of no step, but scored
+    assert f"F1 {float(rows[-1]['f1'])} " in closing
+    for shares in (
+        {"other.safetensors": 0.5, "w/unet.safetensors": 0.5},
+        {"gone.safetensors": 0.1},
+    ):
+        with pytest.raises(UserError, match=r"train_detector\.average|gone"):
+            main(job, PARAMS.model_copy(update={"average": shares}))
 
 
 def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:

@@ -1,0 +1,49 @@
+"""Checkpoints of a training under way: an interrupted one goes on from the last."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from pipeline.io.atomic import write_bytes
+
+Rows = list[list[float | str]]
+
+
+class Resumable(Protocol):
+    """A trainer that tells all that it needs to go on, and goes on from there."""
+
+    def state(self) -> dict[str, Any]: ...
+
+    def restore(self, state: dict[str, Any]) -> None: ...
+
+
+def training_key(told: Mapping[str, Any], *files: Path | None) -> str:
+    """A name for one training: its parameters and the bytes of the files that it starts from."""
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    for file in files:
+        digest.update(file.read_bytes() if file else b"")
+    return digest.hexdigest()[:16]
+
+
+def save_checkpoint(path: Path, trainer: Resumable, rows: Rows) -> None:
+    """Writes all that `load_checkpoint` needs to go on from here."""
+    buffer = io.BytesIO()
+    torch.save({"trainer": trainer.state(), "rows": rows}, buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_checkpoint(path: Path, trainer: Resumable) -> Rows:
+    """Takes the trainer back to where it was saved; the curve's rows so far, none without a file."""
+    if not path.is_file():
+        return []
+    saved = torch.load(path, map_location="cpu", weights_only=True)
+    trainer.restore(saved["trainer"])
+    rows: Rows = saved["rows"]
+    return rows
