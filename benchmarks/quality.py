@@ -2,6 +2,8 @@
 
     python -m benchmarks.quality data/demo
     python -m benchmarks.quality data/demo --rows clean,true --steps 3000 --set samples=12
+    python -m benchmarks.quality data/demo --rows true --shrink 2 --steps 1500 \\
+        --set batch_rays=1024 resolution=384 table_log2=17     # half size: half a minute a row
 
 A scene is a folder with photos and `truth/` (`clean/`, `coverage/`, `cameras.json`, perhaps
 `depth/`), as `synthesize` makes it. Estimated poses and the masks of the stages `masks` and
@@ -16,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,6 +114,34 @@ def load(folder: Path, artifacts: Path) -> Scene:
     return Scene(rainy, clean, coverage, drawn, views)
 
 
+def shrunk(scene: Scene, parts: int) -> Scene:
+    """The scene with photos ``parts`` times smaller along each side; both sides must divide.
+
+    Colours are averaged; a pixel is as wet as the wettest, and kept if all, that it is made of.
+    """
+
+    def cut(image: np.ndarray) -> np.ndarray:
+        height, width = image.shape[:2]
+        return image.reshape(height // parts, parts, width // parts, parts, *image.shape[2:])
+
+    def view(one: View) -> View:
+        fx, fy, cx, cy, _ = one.intrinsics
+        width, height = one.width // parts, one.height // parts
+        camera = {"fx": fx / parts, "fy": fy / parts, "cx": cx / parts, "cy": cy / parts}
+        return replace(one, width=width, height=height, **camera)  # type: ignore[arg-type]
+
+    return Scene(
+        {stem: cut(image).mean((1, 3)) for stem, image in scene.rainy.items()},
+        {stem: cut(image).mean((1, 3)) for stem, image in scene.clean.items()},
+        {stem: cut(cover).max((1, 3)) for stem, cover in scene.coverage.items()},
+        {
+            k: {s: np.all(cut(keep), (1, 3)) for s, keep in v.items()}
+            for k, v in scene.drawn.items()
+        },
+        {k: {s: view(one) for s, one in v.items()} for k, v in scene.views.items()},
+    )
+
+
 def _true_views(truth: Path, stems: list[str], sfm: dict[str, View]) -> dict[str, View]:
     about = read_json(truth / "cameras.json")
     cams = {stem: np.array(about["frames"][stem]["cam_from_world"]) for stem in stems}
@@ -159,6 +189,7 @@ def measure(
     begin = time.process_time()
     fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
         seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
+        average=settings["average"],
         threads=threads)  # fmt: skip
     seconds = time.process_time() - begin
     torch.set_num_threads(threads)
@@ -205,13 +236,14 @@ def main() -> None:
     parser.add_argument("--rows", default=",".join(ROWS))
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--steps", type=int, help="instead of params.yaml's")
+    parser.add_argument("--shrink", type=int, default=1, help="photos so many times smaller")
     parser.add_argument("--set", nargs="*", default=[], help="other parameters, key=value")
     flags = parser.parse_args()
     settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
     settings |= {pair.split("=")[0]: yaml.safe_load(pair.split("=")[1]) for pair in flags.set}
     settings["steps"] = flags.steps or settings["steps"]
     for folder in flags.scenes:
-        scene = load(folder, flags.artifacts / folder.name)
+        scene = shrunk(load(folder, flags.artifacts / folder.name), flags.shrink)
         covered = np.mean([c > TRUE_COVERAGE for c in scene.coverage.values()])
         print(f"{folder.name}: {len(scene.rainy)} views, {covered:.1%} covered, "
               f"{settings['steps']} steps of {settings['batch_rays']} rays")  # fmt: skip

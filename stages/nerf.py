@@ -45,6 +45,7 @@ class Params(Section):
     rate: Annotated[float, Field(gt=0, le=10)]
     precision: Literal["auto", "float32", "bfloat16"]
     exposure: bool
+    average: Annotated[float, Field(ge=0, le=1)]
     near_factor: Annotated[float, Field(gt=0, le=10)]
     far_factor: Annotated[float, Field(ge=1, le=100)]
     save_every: Annotated[int, Field(ge=1)]
@@ -105,13 +106,11 @@ def _fit(
             seed=params.seed,
             rate=params.rate,
             exposure=params.exposure,
+            average=0.0 if paper else params.average,
             shards=2 if job.device == "cpu" else 1,
             threads=cores(),
-            save_every=params.save_every,
-            save=checkpoint.save,
-            resume=resume,
-            progress=show,
-        )
+            save_every=params.save_every, save=checkpoint.save, resume=resume, progress=show,
+        )  # fmt: skip
     return steps, record
 
 

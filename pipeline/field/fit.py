@@ -105,6 +105,48 @@ class Stepper:
                     self.adam.state[parameter][key] = state[f"{key}:{name}"].clone()
 
 
+class Average:
+    """The mean of parameters over the last ``steps - start`` of ``steps`` steps, every tenth and the last.
+
+    Rates of Adam's kind leave parameters wandering about where they have arrived; their mean is
+    nearer to it than any of them (Polyak and Juditsky, doi:10.1137/0330046).
+    """
+
+    EVERY = 10
+
+    def __init__(self, learned: list[nn.Module], steps: int, share: float) -> None:
+        self.named, self.steps, self.span = _named(learned), steps, round(share * steps)
+        self.means: dict[str, Tensor] = {}
+
+    def add(self, done: int) -> None:
+        """The parameters as they are after ``done`` steps, if these count."""
+        left = self.steps - done
+        if left >= self.span or left % self.EVERY:
+            return
+        number = (self.span - 1) // self.EVERY - left // self.EVERY + 1
+        for name, parameter in self.named:
+            if number == 1:
+                self.means[name] = parameter.detach().clone()
+            else:
+                self.means[name].lerp_(parameter.detach(), 1.0 / number)
+
+    def finish(self) -> None:
+        """Gives every parameter its mean, if there is one."""
+        with torch.no_grad():
+            for name, parameter in self.named:
+                if name in self.means:
+                    parameter.copy_(self.means[name])
+
+    def state(self) -> dict[str, Tensor]:
+        """The means by name; what :meth:`restore` takes back."""
+        return {f"mean:{name}": value for name, value in self.means.items()}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continue from :meth:`state`."""
+        names = [name for name, _ in self.named if f"mean:{name}" in state]
+        self.means = {name: state[f"mean:{name}"].clone() for name in names}
+
+
 def fit(
     model: nn.Module,
     buffer: RayBuffer,
@@ -114,6 +156,7 @@ def fit(
     seed: int,
     rate: float = 1.0,
     exposure: bool = False,
+    average: float = 0.0,
     shards: int = 2,
     threads: int = 2,
     log_every: int = 50,
@@ -127,6 +170,8 @@ def fit(
     ``shards`` pieces of each batch run side by side on up to ``threads`` cores: the shards decide
     the bytes, the threads do not. ``rate`` multiplies every learning rate. With
     ``exposure`` each photo has a brightness of its own (``gains`` of the record, ``(V, 3)``).
+    ``average`` is the share of the steps, the last ones, over which the parameters' mean is taken
+    for the field that comes out (0: as the last step left it).
     ``save(step, state)`` is called every ``save_every`` steps;
     ``resume`` takes such a pair and goes on to the same bytes. ``progress(step, loss, psnr)``.
     Raises UserError when the loss is not finite.
@@ -136,11 +181,11 @@ def fit(
     steppers = [stepper for module in learned for stepper in _steppers(module, steps, rate)]
     # The largest first: two threads then finish at about the same time.
     steppers.sort(key=lambda stepper: -sum(one.numel() for one in stepper.parameters))
-    record = Record()
+    record, mean = Record(), Average(learned, steps, average)
     running: list[Tensor] = []
     first = 0
     if resume is not None:
-        first = _restore(learned, steppers, record, resume)
+        first = _restore(learned, steppers, mean, record, resume)
         running = list(resume[1]["running"])
     with _pool(threads, buffer.device) as pool:
         for step in range(first, steps):
@@ -148,6 +193,7 @@ def fit(
             losses = _one_step(model, light, steppers, batch, step, seed, shards, pool)
             running.append(losses)
             done = step + 1
+            mean.add(done)
             if done % log_every == 0 or done == steps:
                 loss, photometric = torch.stack(running).mean(0).tolist()
                 _check_finite(loss, step)
@@ -157,7 +203,8 @@ def fit(
                 if progress is not None:
                     progress(done, loss, psnr)
             if save is not None and save_every and done % save_every == 0 and done < steps:
-                save(done, _state(learned, steppers, record, running))
+                save(done, _state(learned, steppers, mean, record, running))
+    mean.finish()
     if light is not None:
         record.gains = light.gains().detach().cpu()
     return record
@@ -288,9 +335,13 @@ def _check_finite(loss: float, step: int) -> None:
 
 
 def _state(
-    learned: list[nn.Module], steppers: list[Stepper], record: Record, running: list[Tensor]
+    learned: list[nn.Module],
+    steppers: list[Stepper],
+    mean: Average,
+    record: Record,
+    running: list[Tensor],
 ) -> dict[str, Tensor]:
-    state = {f"model:{name}": value.detach() for name, value in _named(learned)}
+    state = {f"model:{name}": value.detach() for name, value in _named(learned)} | mean.state()
     for stepper in steppers:
         state |= stepper.state()
     state["record"] = torch.tensor(record.rows, dtype=torch.float64).reshape(-1, 3)
@@ -306,6 +357,7 @@ def _named(learned: list[nn.Module]) -> list[tuple[str, nn.Parameter]]:
 def _restore(
     learned: list[nn.Module],
     steppers: list[Stepper],
+    mean: Average,
     record: Record,
     resume: tuple[int, dict[str, Tensor]],
 ) -> int:
@@ -315,5 +367,6 @@ def _restore(
             parameter.copy_(state[f"model:{name}"])
     for stepper in steppers:
         stepper.restore(state)
+    mean.restore(state)
     record.rows = [(int(a), b, c) for a, b, c in state["record"].tolist()]
     return step

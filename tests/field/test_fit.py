@@ -115,13 +115,14 @@ class Killed(Exception):
     pass
 
 
+@pytest.mark.parametrize("average", [0.0, 1.0])
 @pytest.mark.parametrize("at", [1, 7, 8, 11])
 def test_a_fit_killed_at_any_step_ends_with_the_same_bytes(
-    photos: list[PosedPhoto], tmp_path: Path, at: int
+    photos: list[PosedPhoto], tmp_path: Path, at: int, average: float
 ) -> None:
     """The process dies after step ``at``, a checkpoint every third step lies on disk; run again."""
     how = {"steps": 12, "batch_rays": 256, "seed": 3, "log_every": 5, "save_every": 3,
-           "exposure": True}  # fmt: skip
+           "exposure": True, "average": average}  # fmt: skip
     checkpoint = Checkpoint(tmp_path / "checkpoint.safetensors", "key")
     whole, dying, later = field(photos), field(photos), field(photos, seed=99)
     first = fit(whole, RayBuffer(photos, 0), **how)
@@ -143,6 +144,24 @@ def test_a_fit_killed_at_any_step_ends_with_the_same_bytes(
     second = fit(later, RayBuffer(photos, 0), resume=resume, **how)
     assert same(whole, later)
     assert first.rows == second.rows
+
+
+def test_the_mean_is_that_of_every_tenth_step_of_the_last_share(photos: list[PosedPhoto]) -> None:
+    """Half of 40 steps: those after 30 and 40, not the 20th; no share, or one step's, is the last step's."""
+    last, none, mean = field(photos), field(photos), field(photos)
+    after: dict[int, list[torch.Tensor]] = {}
+
+    def note(step: int, loss: float, psnr: float) -> None:
+        after[step] = [p.detach().clone() for p in last.parameters()]
+
+    how = {"steps": 40, "batch_rays": 128, "seed": 3, "log_every": 10}
+    fit(last, RayBuffer(photos, 0), progress=note, **how)
+    fit(none, RayBuffer(photos, 0), average=1 / 40, **how)
+    fit(mean, RayBuffer(photos, 0), average=0.5, **how)
+    assert same(last, none)
+    assert not same(last, mean)
+    for got, third, fourth in zip(mean.parameters(), after[30], after[40], strict=True):
+        torch.testing.assert_close(got, (third + fourth) / 2)
 
 
 def test_soft_masks_reach_the_loss(photos: list[PosedPhoto]) -> None:
