@@ -16,8 +16,9 @@ from pipeline.sfm.result import Reconstructed
 
 log = logging.getLogger(__name__)
 
-# Measured: 0.99 and 1.05 times the features' own error where the true poses say that the cameras gained.
-OBJECTION = 1.5
+# Times the features' own error. Measured: 0.98 to 1.05 on six rendered scenes, where true poses say that the
+# error of the cameras fell to a half or a third; 1.39 on photos of foliage, which a field then explained less well.
+OBJECTION = 1.15
 
 
 def with_poses(
