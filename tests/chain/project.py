@@ -31,6 +31,7 @@ LEFT_BEHIND = shutil.ignore_patterns(
 )  # fmt: skip
 # Small enough to see every stage at work within seconds.
 SMALL: dict[str, dict[str, Any]] = {
+    "poses": {"align_rounds": 1, "align_first_steps": 40},
     "refine": {"rounds": 1, "first_steps": 40, "batch_rays": 1024},
     "nerf": {"steps": 40, "batch_rays": 1024, "levels": 2, "table_log2": 12, "resolution": 64},
     "render": {"path_frames": 4, "path_scale": 0.25},
