@@ -1,0 +1,46 @@
+"""What `benchmarks.quality` measures on: a scene of smaller photos is the same scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.quality import Scene, shrunk
+from pipeline.geometry.rays import pixel_rays
+from pipeline.io.transforms import View
+
+
+def scene() -> Scene:
+    colours = np.random.default_rng(0).random((4, 6, 3)).astype(np.float32)
+    wet = np.zeros((4, 6), np.float32)
+    wet[1, 3] = 0.5
+    view = View("a", np.eye(4), 5.0, 6.0, 2.5, 1.75, 0.0, 6, 4, 1.0, 9.0)
+    drawn = {"masks": {"a": wet == 0}, "refine": {}}
+    return Scene({"a": colours}, {"a": 1 - colours}, {"a": wet}, drawn, {"true": {"a": view}})
+
+
+def test_a_pixel_is_the_mean_of_its_parts_and_wet_if_one_is() -> None:
+    big, small = scene(), shrunk(scene(), 2)
+    assert small.rainy["a"].shape == (2, 3, 3)
+    assert small.rainy["a"][1, 2] == pytest.approx(big.rainy["a"][2:, 4:].mean((0, 1)))
+    assert small.clean["a"][0, 0] == pytest.approx(big.clean["a"][:2, :2].mean((0, 1)))
+    assert np.argwhere(small.coverage["a"]).tolist() == [[0, 1]]
+    assert np.argwhere(~small.drawn["masks"]["a"]).tolist() == [[0, 1]]
+
+
+def test_a_pixel_looks_along_the_mean_of_its_parts_rays() -> None:
+    big, small = scene().views["true"]["a"], shrunk(scene(), 2).views["true"]["a"]
+    assert (small.width, small.height) == (3, 2)
+    pose = torch.eye(4)[:3]
+    columns, rows = torch.tensor([4, 5, 4, 5]), torch.tensor([2, 2, 3, 3])
+    _, parts = pixel_rays(columns, rows, torch.tensor(big.intrinsics), pose)
+    _, whole = pixel_rays(
+        torch.tensor([2]), torch.tensor([1]), torch.tensor(small.intrinsics), pose
+    )
+    torch.testing.assert_close(whole[:, 0], parts.mean(1))
+
+
+def test_one_part_is_the_scene_itself() -> None:
+    assert np.array_equal(shrunk(scene(), 1).rainy["a"], scene().rainy["a"])
+    assert shrunk(scene(), 1).views["true"]["a"].intrinsics == scene().views["true"]["a"].intrinsics
