@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pipeline.report.notes import masks_note, rounds_note
+from pipeline.report.notes import masks_note, poses_note, rounds_note
 
 
 def test_the_rounds_are_told_in_their_order_with_what_is_known() -> None:
@@ -25,3 +25,10 @@ def test_masks_that_came_along_have_no_threshold_and_no_rounds() -> None:
     )
     untouched = rounds_note({"mode": "none", "why": why, "rounds": {}}, {})
     assert untouched == f" They were not repaired from the scene: {why}."
+
+
+def test_it_is_said_whether_cameras_were_aligned() -> None:
+    account = {"registered": ["a", "b"], "points": 10, "reprojection_px": 0.5}
+    assert poses_note(account, 3) == "2 of 3 photos were placed; 10 points, 0.50 px off on average."
+    aligned = poses_note({**account, "aligned": True}, 3)
+    assert aligned.endswith("; the cameras are aligned to the photos' dry pixels.")

@@ -160,3 +160,4 @@ def test_a_capture_with_poses_and_masks_goes_through_the_stages(scene, tmp_path)
         assert 0 < view.near < view.far
     account = json.loads((job.paths.poses / "poses.json").read_text())
     assert account["tried"][0]["label"] == "poses as given" and account["lost"] == []
+    assert account["aligned"] is False
