@@ -79,10 +79,15 @@ def test_killed_while_writing(whole: Workshop) -> None:
     [(signal.SIGTERM, 143, ""), (signal.SIGINT, 130, "interrupted; nothing half-written is left")],
 )
 def test_stopped_while_writing(whole: Workshop, how: signal.Signals, code: int, told: str) -> None:
-    _without(whole, "attention")
-    before = whole.files()
-    process = _start(whole, "attention")
-    ended, said = _stop_when(process, lambda: _pieces(whole, "attention"), how)
+    for _ in range(
+        4
+    ):  # on a busy machine the stage may end before the signal reaches it: once more
+        _without(whole, "attention")
+        before = whole.files()
+        process = _start(whole, "attention")
+        ended, said = _stop_when(process, lambda: _pieces(whole, "attention"), how)
+        if ended:
+            break
     assert ended == code, said
     assert told in said and "Traceback" not in said
     assert whole.files() == before
