@@ -20,12 +20,12 @@ from pipeline.attention.samples import VISIBLE_COVERAGE
 from pipeline.attention.weights import Detector, load_network
 from pipeline.evaluation.masks import MaskScores, mask_counts, mask_scores
 from pipeline.evaluation.references import find_references, read_reference
-from pipeline.field.growing import GrowingField
 from pipeline.io.paths import ScenePaths
 from pipeline.io.posed import read_posed_images
 from pipeline.io.transforms import read_transforms
+from pipeline.masking.glass import GlassCamera
 from pipeline.masking.loop import repair
-from stages.refine import BEYOND, _camera
+from stages.refine import BEYOND
 
 
 def gathered(network: Detector, paths: ScenePaths) -> tuple[str, MaskScores]:
@@ -35,11 +35,14 @@ def gathered(network: Detector, paths: ScenePaths) -> tuple[str, MaskScores]:
     records = [image.record for image in images]
     covers = find_references(paths.truth / "coverage", records)
     assert covers is not None, f"{paths.truth} holds no coverage"
-    near = GrowingField(images, 2.0, 0, "cpu").near
+    near = min(view.near for view in views.values())
     done = repair(
         lambda drop_masks, found: [],  # without rounds nothing is looked at
         [attend(network, np.asarray(image.rgb, np.float32)) for image in images],
-        [_camera(image) for image in images],
+        [
+            GlassCamera(i.view.cam_from_world, i.view.intrinsics, i.view.width, i.view.height)
+            for i in images
+        ],
         [~image.keep_mask for image in images],
         BEYOND * near,
         rounds=0,

@@ -195,19 +195,23 @@ def fit(
             done = step + 1
             mean.add(done)
             if done % log_every == 0 or done == steps:
-                loss, photometric = torch.stack(running).mean(0).tolist()
-                _check_finite(loss, step)
-                psnr = -10.0 * math.log10(max(photometric, 1e-12))
-                record.rows.append((done, loss, psnr))
+                record.rows.append(_row(done, running))
                 running.clear()
                 if progress is not None:
-                    progress(done, loss, psnr)
+                    progress(*record.rows[-1])
             if save is not None and save_every and done % save_every == 0 and done < steps:
                 save(done, _state(learned, steppers, mean, record, running))
     mean.finish()
     if light is not None:
         record.gains = light.gains().detach().cpu()
     return record
+
+
+def _row(done: int, losses: list[Tensor]) -> tuple[int, float, float]:
+    """Step, mean loss and PSNR of the steps since the last row; UserError when they are not finite."""
+    loss, photometric = torch.stack(losses).mean(0).tolist()
+    _check_finite(loss, done - 1)
+    return done, loss, -10.0 * math.log10(max(photometric, 1e-12))
 
 
 def _one_step(
