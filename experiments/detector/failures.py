@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from experiments.detector.score import named_detector
 from pipeline.attention.inference import attend
 from pipeline.attention.pools import read_rendered
 from pipeline.attention.samples import VISIBLE_COVERAGE
-from pipeline.attention.weights import load_network
 
 
 def main() -> None:
@@ -25,8 +25,7 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, required=True)
     parser.add_argument("--threshold", type=float, default=0.25)
     flags = parser.parse_args()
-    model, file = flags.detector.split(":", 1)
-    network = load_network(Path(file), model).for_inference()
+    network = named_detector(flags.detector)
     rows = []
     rainy, _, coverage = read_rendered(flags.rendered)
     for picture, cover in zip(rainy, coverage, strict=True):

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from experiments.detector.score import named_detector
 from pipeline.attention.inference import attend
 from pipeline.attention.samples import VISIBLE_COVERAGE
-from pipeline.attention.weights import Detector, load_network
+from pipeline.attention.weights import Detector
 from pipeline.evaluation.masks import MaskScores, mask_counts, mask_scores
 from pipeline.evaluation.references import find_references, read_reference
 from pipeline.io.paths import ScenePaths
@@ -65,8 +66,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--root", type=Path, default=Path(), help="folder of data/ and artifacts/")
     flags = parser.parse_args()
-    model, file = flags.detector.split(":", 1)
-    network = load_network(Path(file), model).for_inference()
+    network = named_detector(flags.detector)
     print(f"{flags.detector}\n{'scene':14s} glass     P     R   IoU")
     for scene in flags.scenes:
         mode, scores = gathered(network, ScenePaths(flags.root.resolve(), scene))

@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 import torch
 
-from experiments.detector.score import aligned, pair_cases
+from experiments.detector.score import aligned, named_detector, pair_cases
 from pipeline.attention.inference import attend
-from pipeline.attention.weights import load_network
 from pipeline.io.images import read_photo
 
 FOUND, TOO_MUCH, MISSED = (0.0, 0.45, 0.0), (0.45, 0.0, 0.0), (0.0, 0.1, 0.45)
@@ -45,8 +44,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=Path, required=True)
     parser.add_argument("--threshold", type=float, default=0.25)
     flags = parser.parse_args()
-    model, file = flags.detector.split(":", 1)
-    network = load_network(Path(file), model).for_inference()
+    network = named_detector(flags.detector)
     flags.out.mkdir(parents=True, exist_ok=True)
     for name, photo, wet, sure in pair_cases(flags.pairs):
         marked = attend(network, photo) >= flags.threshold

@@ -127,6 +127,12 @@ def _unit(photo: np.ndarray) -> np.ndarray:
     return photo.astype(np.float32) / 255
 
 
+def named_detector(name: str) -> Detector:
+    """The detector that MODEL:FILE names, ready for inference."""
+    model, file = name.split(":", 1)
+    return load_network(Path(file), model).for_inference()
+
+
 def main() -> None:
     """Reads the command line and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -144,9 +150,8 @@ def main() -> None:
     flags = parser.parse_args()
     print(f"threshold {flags.threshold:g}, scales {flags.scales}")
     for detector in flags.detectors:
-        model, file = detector.split(":", 1)
         print(f"\n{detector}\n{'set':40s}    P     R    F1   IoU | best    at    AP")
-        network = load_network(Path(file), model).for_inference()
+        network = named_detector(detector)
         for name, tally in tallies(network, flags):
             figures = tally.row(flags.threshold)
             print(f"{name:40s} " + " ".join(f"{v:5.3f}" for v in figures.values()), flush=True)

@@ -10,13 +10,13 @@ import argparse
 import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from experiments.detector.score import named_detector
 from pipeline.attention.inference import attend
-from pipeline.attention.weights import Detector, load_network
+from pipeline.attention.weights import Detector
 from pipeline.parallel import cores
 
 SIZES = ((480, 360), (1920, 1080))
@@ -29,8 +29,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=4)
     flags = parser.parse_args()
     for detector in flags.detectors:
-        model, file = detector.split(":", 1)
-        network = load_network(Path(file), model).for_inference()
+        network = named_detector(detector)
         for width, height in SIZES:
             photo = np.random.default_rng(0).random((height, width, 3), np.float32)
 
