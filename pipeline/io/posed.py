@@ -7,16 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import psutil
 
 from pipeline.errors import UserError
 from pipeline.io.images import read_image
 from pipeline.io.masks import read_keep_mask
+from pipeline.io.memory import free_memory
 from pipeline.io.scene import ImageRecord, read_images_json
 from pipeline.io.transforms import View
 
 # Per pixel in a fit: colours as float32, a mask, and in the shuffled rays the colours and two orders.
 HELD_BYTES = 25
+MOST_PIXELS = 2**31 - 1  # pixels are numbered through in 32 bits
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,19 @@ def read_posed_images(
 
 def _refuse_too_large(records: Sequence[ImageRecord]) -> None:
     """Told by their listed sizes, before any is read: else the system would end the fit without a word."""
-    needed = HELD_BYTES * sum(record.width * record.height for record in records)
-    free = psutil.virtual_memory().available + psutil.swap_memory().free
-    if needed > free:
-        width, height = records[0].size
+    pixels = sum(record.width * record.height for record in records)
+    needed, free = HELD_BYTES * pixels, free_memory()
+    if pixels <= MOST_PIXELS and needed <= free:
+        return
+    width, height = records[0].size
+    if pixels > MOST_PIXELS:
         raise UserError(
-            f"{len(records)} photos of {width}x{height} need about {needed / 1e9:.1f} GB of memory in a "
-            f"fit; {free / 1e9:.1f} GB are free.",
-            "Lower ingest.max_size or ingest.frames, or end other programs.",
+            f"{len(records)} photos of {width}x{height} have {pixels / 1e9:.1f} thousand million pixels; a "
+            f"fit takes {MOST_PIXELS / 1e9:.1f} at most.",
+            "Lower ingest.max_size or ingest.frames.",
         )
+    raise UserError(
+        f"{len(records)} photos of {width}x{height} need about {needed / 1e9:.1f} GB of memory in a "
+        f"fit; {free / 1e9:.1f} GB are free.",
+        "Lower ingest.max_size or ingest.frames, end other programs, or raise the container's limit.",
+    )

@@ -194,3 +194,16 @@ def test_photos_that_do_not_fit_into_memory_are_told_before_any_is_read(
     told = r"2 photos of 64x48 need about 0\.0 GB" if spare else r"a\.png does not exist"
     with pytest.raises(UserError, match=told):
         read_posed_images(tmp_path, None, {name: _view(name) for name in names})
+
+
+@pytest.mark.parametrize("over", [1, 0])
+def test_more_pixels_than_a_fit_can_number_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, over: int
+) -> None:
+    """They are numbered from 0 in 32 bits with a sign: 2^31 - 1 are enough, one more is not."""
+    monkeypatch.setattr("pipeline.io.posed.free_memory", lambda: 2**60)
+    record = ImageRecord("a.png", "a.png", "", 2**31 - 1 + over, 1, None, "train", 0)
+    write_images_json(tmp_path, [record])
+    told = r"2\.1 thousand million pixels" if over else r"a\.png does not exist"
+    with pytest.raises(UserError, match=told):
+        read_posed_images(tmp_path, None, {"a.png": _view("a.png")})
