@@ -20,6 +20,8 @@ from pipeline.io.transforms import GL_FROM_CV, View
 SAME_SHAPE = 0.01  # how far the ratios of width to height of a photo and its camera may differ
 RIGID = 1e-4  # how far R R^T may be from the identity
 MOST_BENT = 0.25  # |k1| r^2 in the corner up to which rays through one radial term are exact
+COVERED = 0.95  # a straightened picture that is filled less shows a lens model folding back
+GLANCE_PX = 160  # longest side of the picture on which that is tried
 _MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 
@@ -110,7 +112,10 @@ class Straightener:
 
 
 def straightened(view: GivenView) -> GivenView:
-    """The pinhole without distortion whose picture of the same size is covered by `view`'s wholly."""
+    """The pinhole without distortion whose picture of the same size is covered by `view`'s wholly.
+
+    UserError when there is none: the lens model folds back within the photo.
+    """
     size = (view.width, view.height)
     matrix, coefficients = _matrix(view, size), np.array(view.distortion, np.float64)
     if view.fisheye:
@@ -120,7 +125,7 @@ def straightened(view: GivenView) -> GivenView:
     else:
         new = cv2.getOptimalNewCameraMatrix(matrix, coefficients, size, alpha=0.0)[0]
     # OpenCV puts the centre of pixel (0, 0) at (0, 0).
-    return replace(
+    straight = replace(
         view,
         fx=float(new[0, 0]),
         fy=float(new[1, 1]),
@@ -129,6 +134,18 @@ def straightened(view: GivenView) -> GivenView:
         distortion=(),
         fisheye=False,
     )
+    height, width = (max(2, round(side * GLANCE_PX / max(size))) for side in size[::-1])
+    filled = np.isfinite(new).all() and new[0, 0] > 0 and new[1, 1] > 0
+    if (
+        not filled
+        or Straightener(view, straight)(np.ones((height, width), np.uint8)).mean() < COVERED
+    ):
+        raise UserError(
+            f"{view.photo} was taken through a lens that cannot be straightened: its distortion "
+            f"{view.distortion} folds the picture back.",
+            "Check the distortion in the file of the poses, or undistort the photos first.",
+        )
+    return straight
 
 
 def _matrix(view: GivenView, size: tuple[int, int]) -> np.ndarray:
@@ -148,6 +165,19 @@ def checked_rigid(pose: np.ndarray, whose: str) -> np.ndarray:
     return pose
 
 
+def checked_camera(view: GivenView, whose: str) -> GivenView:
+    """`view` itself; UserError naming `whose` it is when its numbers are none of a camera's."""
+    lens = (view.fx, view.fy, view.cx, view.cy, *view.distortion)
+    if not np.isfinite([*lens, view.near, view.far]).all():
+        problem = "holds numbers that are not finite"
+    elif min(view.fx, view.fy, view.width, view.height) <= 0:
+        problem = "has a focal length or size that is not positive"
+    else:
+        checked_rigid(view.cam_from_world, f"{whose}: the pose of {view.photo.name}")
+        return view
+    raise UserError(f"{whose}: the camera of {view.photo.name} {problem}.", "Export it again.")
+
+
 def read_nerfstudio(path: Path) -> list[GivenView]:
     """The cameras of a nerfstudio (or instant-ngp) transforms.json, in the file's order.
 
@@ -157,7 +187,7 @@ def read_nerfstudio(path: Path) -> list[GivenView]:
     content = read_json(path)
     try:
         views = [_nerfstudio_view(path, content, frame) for frame in content["frames"]]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{path} is not a list of posed photos ({error!r}).",
             "nerfstudio's format is expected: frames with file_path and transform_matrix.",
@@ -180,11 +210,12 @@ def _nerfstudio_view(path: Path, content: dict[str, Any], frame: dict[str, Any])
     if not (width and height):
         raise UserError(f"{path} does not tell the photos' size.", 'Add "w" and "h" in pixels.')
     focal = float(both["fl_x"]) if "fl_x" in both else _focal(width, float(both["camera_angle_x"]))
-    fisheye = model == "OPENCV_FISHEYE"
+    fisheye = model == "OPENCV_FISHEYE" or bool(both.get("is_fisheye"))  # the latter: instant-ngp's
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     world_from_gl = np.asarray(frame["transform_matrix"], np.float64).reshape(4, 4)
     checked_rigid(world_from_gl, f"{path}: the pose of {photo.name}")
-    return GivenView(
+    mask = frame.get("mask_path")
+    view = GivenView(
         photo=photo,
         cam_from_world=np.linalg.inv(world_from_gl @ GL_FROM_CV),
         width=width,
@@ -197,12 +228,13 @@ def _nerfstudio_view(path: Path, content: dict[str, Any], frame: dict[str, Any])
         fisheye=fisheye,
         near=float(frame.get("near", 0.0)),
         far=float(frame.get("far", 0.0)),
-        mask_path=_existing(path, str(frame["mask_path"])) if "mask_path" in frame else None,
+        mask_path=_existing(path, str(mask)) if mask else None,
     )
+    return checked_camera(view, str(path))
 
 
 def _focal(width: int, angle: float) -> float:
-    return 0.5 * width / math.tan(0.5 * angle)
+    return 0.5 * width / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
 
 
 def _existing(path: Path, relative: str) -> Path:

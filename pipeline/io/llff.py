@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import read_npy
-from pipeline.io.given import GivenView, checked_rigid
+from pipeline.io.given import GivenView, checked_camera, checked_rigid
 from pipeline.io.transforms import View
 
 
@@ -37,8 +37,10 @@ def read_poses_bounds(path: Path, photos: Sequence[Path]) -> list[GivenView]:
     another number of photos.
     """
     rows = read_npy(path)
-    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
-        raise UserError(f"{path} has shape {rows.shape}; N rows of 17 numbers are expected.")
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
+        raise UserError(
+            f"{path} has shape {rows.shape} of {rows.dtype}; N rows of 17 numbers are expected."
+        )
     if len(rows) != len(photos):
         raise UserError(
             f"{path} holds {len(rows)} poses, but there are {len(photos)} photos.",
@@ -51,18 +53,21 @@ def read_poses_bounds(path: Path, photos: Sequence[Path]) -> list[GivenView]:
         world_from_cam = np.eye(4)
         world_from_cam[:3] = np.stack([right, down, -back, place], axis=1)
         checked_rigid(world_from_cam, f"{path}: the pose of {photo.name}")
-        views.append(
-            GivenView(
-                photo=photo,
-                cam_from_world=np.linalg.inv(world_from_cam),
-                width=round(width),
-                height=round(height),
-                fx=focal,
-                fy=focal,
-                cx=width / 2,
-                cy=height / 2,
-                near=float(row[15]),
-                far=float(row[16]),
-            )
+        view = GivenView(
+            photo=photo,
+            cam_from_world=np.linalg.inv(world_from_cam),
+            width=_pixels(width),
+            height=_pixels(height),
+            fx=focal,
+            fy=focal,
+            cx=width / 2,
+            cy=height / 2,
+            near=float(row[15]),
+            far=float(row[16]),
         )
+        views.append(checked_camera(view, str(path)))
     return views
+
+
+def _pixels(side: float) -> int:
+    return round(side) if np.isfinite(side) else 0

@@ -85,7 +85,9 @@ def read_rain_mask(path: Path, count: int) -> np.ndarray:
     Soft masks are cut at 0.5. UserError when damaged, of another shape, or not within [0, 1].
     """
     values = read_npy(path)
-    if values.ndim != 3 or values.shape[2] != count:
+    if values.dtype.kind not in "bfiu":
+        raise UserError(f"{path} holds {values.dtype}, not numbers.", "Save it as uint8 or float.")
+    if values.ndim != 3 or values.shape[2] != count or not values.size:
         raise UserError(
             f"{path} has shape {values.shape}; (height, width, {count}) is expected.",
             "Its last axis counts the photos in name order, and every photo needs its mask.",

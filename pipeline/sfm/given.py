@@ -14,7 +14,7 @@ import pycolmap
 
 from pipeline.errors import UserError
 from pipeline.geometry.poses import as_4x4
-from pipeline.io.given import GivenView
+from pipeline.io.given import GivenView, checked_camera
 from pipeline.io.transforms import View
 from pipeline.sfm.database import Progress, build_database
 from pipeline.sfm.model import points_of, with_depths
@@ -78,7 +78,7 @@ def _given(folder: Path, photo: Path, image: pycolmap.Image) -> GivenView:
     params = [float(value) for value in camera.params]
     bent = dict(zip(names, params[focals + 2 :], strict=True))
     order = _ORDER_FISHEYE if fisheye else _ORDER
-    return GivenView(
+    view = GivenView(
         photo=photo,
         cam_from_world=as_4x4(image.cam_from_world().matrix()),
         width=int(camera.width),
@@ -90,6 +90,7 @@ def _given(folder: Path, photo: Path, image: pycolmap.Image) -> GivenView:
         distortion=tuple(bent.get(name, 0.0) for name in order) if names else (),
         fisheye=fisheye,
     )
+    return checked_camera(view, str(folder))
 
 
 def triangulate(

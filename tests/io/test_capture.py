@@ -73,6 +73,42 @@ def test_llff_needs_a_row_per_photo(tmp_path: Path) -> None:
         _find(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        (14, 0.0, "not positive"),
+        (14, np.nan, "not finite"),
+        (4, 0.0, "not positive"),
+        (9, np.inf, "not finite"),
+        (16, np.nan, "not finite"),
+        (3, np.nan, "not a rotation"),
+    ],
+)
+def test_llff_cameras_that_are_none(
+    tmp_path: Path, column: int, value: float, message: str
+) -> None:
+    """Row by row: columns 4, 9 and 14 are H, W and f, 16 the far depth, 3 a place."""
+    _photos(tmp_path / "images")
+    rows = np.stack([_llff_row(x, 30, 40, 35.0) for x in (0.0, 1.0, 2.0)])
+    rows[1, column] = value
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    with pytest.raises(UserError, match=rf"poses_bounds\.npy: the \w+ of b\.jpg .*{message}"):
+        _find(tmp_path)
+
+
+def test_arrays_of_text_are_told(tmp_path: Path) -> None:
+    _photos(tmp_path / "images")
+    np.save(tmp_path / "poses_bounds.npy", np.full((3, 17), "rain"))
+    with pytest.raises(UserError, match="17 numbers are expected"):
+        _find(tmp_path)
+    np.save(tmp_path / "r.npy", np.full((3, 4, 2), "rain"))
+    with pytest.raises(UserError, match="not numbers"):
+        read_rain_mask(tmp_path / "r.npy", 2)
+    np.save(tmp_path / "r.npy", np.zeros((0, 0, 2)))
+    with pytest.raises(UserError, match="is expected"):
+        read_rain_mask(tmp_path / "r.npy", 2)
+
+
 def test_an_array_of_objects_is_not_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", np.array([{"a": 1}], object), allow_pickle=True)
     with pytest.raises(UserError, match="not a readable array"):
@@ -117,12 +153,40 @@ def test_nerfstudio_axes_and_intrinsics_are_read(tmp_path: Path) -> None:
         ({"w": 0}, "does not tell the photos' size"),
         ({"frames": [{}]}, "not a list of posed photos"),
         ({"fl_x": "wide"}, "not a list of posed photos"),
+        ({"w": float("inf")}, "not a list of posed photos"),
+        ({"w": -80, "h": -60}, r"the camera of a\.jpg .* not positive"),
+        ({"fl_x": 0.0}, r"the camera of a\.jpg .* not positive"),
+        ({"fl_y": -72.0}, r"the camera of a\.jpg .* not positive"),
+        ({"fl_x": float("nan")}, r"the camera of a\.jpg .* not finite"),
+        ({"k1": float("nan")}, r"the camera of a\.jpg .* not finite"),
+        ({"cx": float("inf")}, r"the camera of a\.jpg .* not finite"),
     ],
 )
 def test_bad_transforms_are_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     _photos(tmp_path / "images")
     with pytest.raises(UserError, match=message):
         read_nerfstudio(_write(tmp_path, _transforms(tmp_path) | change))
+
+
+@pytest.mark.parametrize("angle", [0.0, -0.5, 4.0])
+def test_an_angle_that_no_lens_sees(tmp_path: Path, angle: float) -> None:
+    _photos(tmp_path / "images")
+    content = _transforms(tmp_path) | {"camera_angle_x": angle}
+    del content["fl_x"]
+    with pytest.raises(UserError, match=r"the camera of a\.jpg"):
+        read_nerfstudio(_write(tmp_path, content))
+
+
+def test_instant_ngps_fisheyes_and_masks_that_are_null(tmp_path: Path) -> None:
+    """It tells them by a flag, where nerfstudio names the model; k3 and k4 then are the fisheye's."""
+    _photos(tmp_path / "images")
+    content = _transforms(tmp_path, is_fisheye=True, k1=0.01, k2=0.02, k3=0.03, k4=0.04, p1=9.0)
+    for frame in content["frames"]:
+        frame["mask_path"] = None
+    view = read_nerfstudio(_write(tmp_path, content))[0]
+    assert view.fisheye and view.distortion == (0.01, 0.02, 0.03, 0.04)
+    assert view.mask_path is None
+    assert not read_nerfstudio(_write(tmp_path, content | {"is_fisheye": False}))[0].fisheye
 
 
 def test_a_pose_that_is_not_rigid_and_a_photo_that_is_not_there_are_named(tmp_path: Path) -> None:
@@ -182,6 +246,18 @@ def test_straightened_lines_are_where_a_pinhole_sees_them(fisheye: bool) -> None
         assert found == pytest.approx(expected, abs=0.1)
     white = Straightener(bent, straight)(np.ones((300, 400), np.uint8))
     assert white.all(), "the straight picture is covered wholly"
+
+
+@pytest.mark.parametrize(
+    ("distortion", "fisheye"), [((0.0, -30.0, 0.0, 0.0), False), ((-3.0, 0.0, 0.0, 0.0), True)]
+)
+def test_a_lens_that_folds_back_is_not_straightened(
+    distortion: tuple[float, ...], fisheye: bool
+) -> None:
+    """r - 30 r^5 falls from r = 0.29 on, and in the corner r is 0.75: nothing is seen there."""
+    bent = GivenView(Path("a.jpg"), np.eye(4), 120, 90, 100, 100, 60, 45, distortion, fisheye)
+    with pytest.raises(UserError, match=r"a\.jpg was taken .* cannot be straightened"):
+        straightened(bent)
 
 
 def test_rain_mask_has_the_official_layout_and_polarity(tmp_path: Path) -> None:

@@ -50,6 +50,32 @@ def pass_on(scene, views, work, names=None):
     return triangulate(scene.images, None, names, views, work_dir=work, settings=SETTINGS)
 
 
+@pytest.mark.parametrize(
+    ("width", "focal", "place", "told"),
+    [
+        (120, 100.0, 0.25, ""),
+        (0, 100.0, 0.25, "not positive"),
+        (120, 0.0, 0.25, "not positive"),
+        (120, np.nan, 0.25, "not finite"),
+        (120, 100.0, np.nan, "not a rotation"),
+    ],
+)
+def test_colmap_cameras_that_are_none(tmp_path: Path, width, focal, place, told) -> None:
+    model = pycolmap.Reconstruction()
+    lens = [focal, 110, 60, 45]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=90, params=lens, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), np.array([place, 0.5, 0.0]))
+    image = pycolmap.Image(name="a.jpg", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pose)
+    model.write_binary(str(tmp_path))
+    if told:
+        with pytest.raises(UserError, match=rf"a\.jpg .*{told}"):
+            read_colmap(tmp_path, [Path("a.jpg")])
+    else:
+        assert read_colmap(tmp_path, [Path("a.jpg")])[0].fx == 100.0
+
+
 def test_given_poses_stay_and_points_tell_the_depths(scene, tmp_path):
     views = true_views(scene)
     found = pass_on(scene, views, tmp_path)
