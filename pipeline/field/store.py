@@ -57,8 +57,15 @@ def load_field(folder: Path, device: str) -> Fitted:
 def _load_field(folder: Path, device: str, written: int) -> Fitted:
     about = read_json(folder / "field.json", made_by="nerf")
     tensors, _ = load_tensors(folder / "field.safetensors", "Run `python -m stages.nerf` first.")
-    bounds = about["bounds"]
-    return Fitted(restore(about, tensors).to(device), bounds["near"], bounds["far"])
+    field = restore(about, tensors).to(device)
+    try:
+        near, far = (float(about["bounds"][name]) for name in ("near", "far"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{folder / 'field.json'} tells no depths ({error!r}).",
+            "Run `python -m stages.nerf` again.",
+        ) from None
+    return Fitted(field, near, far)
 
 
 def fit_key(

@@ -137,15 +137,21 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, made_by: str = "") -> Any:
-    """The content of a JSON file; UserError when it is missing or damaged, naming the stage that makes it."""
+def read_json(path: Path, made_by: str = "") -> dict[str, Any]:
+    """The object in a JSON file; UserError when it is missing or damaged, naming the stage that makes it."""
     hint = f"Run `python -m stages.{made_by}` first." if made_by else "Restore the file."
+    again = hint.replace("first", "again")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))  # some editors put a mark first
     except FileNotFoundError:
         raise UserError(f"{path} does not exist.", hint) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is damaged: {error}.", hint.replace("first", "again")) from None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}).", again) from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is damaged: {error}.", again) from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path} is damaged: it holds a {type(content).__name__}.", again)
+    return content
 
 
 def read_npy(path: Path) -> np.ndarray:
@@ -153,4 +159,6 @@ def read_npy(path: Path) -> np.ndarray:
     try:
         return np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path} is not a readable array ({error}).") from None
+        raise UserError(
+            f"{path} is not a readable array ({error}).", "Save it anew with numpy.save."
+        ) from None

@@ -35,10 +35,15 @@ def read_posed_images(
 ) -> list[PosedImage]:
     """The images that have a pose, in name order, held-out ones included.
 
-    Without a folder of `keep_masks` every pixel is kept. UserError when a file is missing or damaged,
-    or when the memory that is free cannot hold what a fit of them holds.
+    Without a folder of `keep_masks` every pixel is kept. UserError when none has a pose, when a file is
+    missing or damaged, or when the memory that is free cannot hold what a fit of them holds.
     """
     records = [record for record in read_images_json(images) if record.name in views]
+    if not records:
+        raise UserError(
+            f"no photo in {images} has a pose.",
+            "Run `python -m stages.poses` again; poses/poses.json tells why photos were lost.",
+        )
     _refuse_too_large(records)
     found = []
     for record in records:

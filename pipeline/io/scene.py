@@ -91,7 +91,13 @@ def read_images_json(folder: Path) -> list[ImageRecord]:
     content = read_json(folder / FILE, made_by="ingest")
     try:
         records = [ImageRecord(**entry) for entry in content["images"]]
-    except (KeyError, TypeError) as error:
+        if not records:
+            raise ValueError("it names none")
+        if not all(isinstance(r.name, str) and Path(r.name).name == r.name for r in records):
+            raise ValueError("a name is none of a file")
+        if not all(isinstance(side, int) and side > 0 for r in records for side in r.size):
+            raise ValueError("a size is not in pixels")
+    except (KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{folder / FILE} is not a list of images ({error}).",
             "Run `python -m stages.ingest` again.",

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import UserError
 from pipeline.io.given import Straightener
 from pipeline.io.images import as_bytes, read_image
 from pipeline.io.maps import read_depth, read_map
@@ -59,8 +58,6 @@ def read_straight(paths: ScenePaths) -> StraightScene:
     keep_masks = paths.refine if paths.refine.is_dir() else paths.masks
     views = read_transforms(paths.poses / "transforms.json")
     images = read_posed_images(paths.images, keep_masks if keep_masks.is_dir() else None, views)
-    if not images:
-        raise UserError(f"{paths.poses} has no posed image.", "Run `python -m stages.poses`.")
     posed = [image.view for image in images]
     straight = common_pinholes(posed)
     return StraightScene(paths, images, straight, straighteners_to(posed, straight))

@@ -95,7 +95,7 @@ def read_transforms(path: Path) -> dict[str, View]:
     content = read_json(path, made_by="poses")
     try:
         views = [_view(frame) for frame in content["frames"]]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{path} is not a list of posed views ({error!r}).",
             "Run `python -m stages.poses` again.",

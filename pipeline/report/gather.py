@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.errors import UserError
 from pipeline.io.atomic import read_json
 from pipeline.io.images import read_image
 from pipeline.io.maps import read_depth, read_map
@@ -80,17 +81,32 @@ def coverage_heat(
     return data_uri(coloured(share / (largest or 1)), width, quality), largest
 
 
-def optional_json(path: Path) -> Any:
+def optional_json(path: Path) -> dict[str, Any]:
     """The content of a JSON file, or an empty dict when it does not exist."""
     return read_json(path) if path.is_file() else {}
+
+
+def _rows(path: Path, column: str, made_by: str) -> list[dict[str, str]]:
+    """The rows of a CSV file by their headings; UserError when it has no such `column`."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file, restval="", restkey=""))
+        damaged = any(column not in row or "" in row for row in rows)
+    except (csv.Error, UnicodeDecodeError):
+        damaged = True
+    if damaged:
+        raise UserError(
+            f"{path} is not a table with a column {column}.",
+            f"Run `python -m stages.{made_by}` again.",
+        )
+    return rows
 
 
 def fit_curves(path: Path) -> dict[str, list[tuple[float, float]]]:
     """The columns of fit.csv over its first one, by their headings; empty without the file."""
     if not path.is_file():
         return {}
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = _rows(path, "step", "nerf")
     if not rows:
         return {}
     first, *others = rows[0]
@@ -104,8 +120,7 @@ def image_numbers(path: Path) -> dict[str, dict[str, float]]:
     """The numbers of metrics.csv by image and dotted name; empty cells are left out."""
     if not path.is_file():
         return {}
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = {row.pop("image"): row for row in csv.DictReader(file)}
+    rows = {row.pop("image"): row for row in _rows(path, "image", "evaluate")}
     return {
         image: {
             name: number for name, text in row.items() if math.isfinite(number := _number(text))

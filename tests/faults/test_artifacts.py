@@ -77,6 +77,7 @@ def _frame(change: Callable[[dict[str, Any]], Any]) -> Callable[[Workshop], None
         lambda frame: frame.update(fl_x="wide"),
         lambda frame: frame.update(fl_x=float("nan")),
         lambda frame: frame.update(fl_y=0.0),
+        lambda frame: frame.update(w=float("inf")),
         lambda frame: frame.update(transform_matrix=[[1, 0, 0, 0]] * 4),
         lambda frame: frame.update(transform_matrix=np.full((4, 4), np.nan).tolist()),
         lambda frame: frame.update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()),
@@ -96,6 +97,67 @@ def test_no_pose_at_all(whole: Workshop) -> None:
     path = whole.artifacts / "poses/transforms.json"
     path.write_text(json.dumps({"frames": []}))
     whole.refuses("nerf", "pose")
+
+
+@pytest.mark.parametrize("stage", ["refine", "nerf", "export"])
+def test_poses_of_other_photos(whole: Workshop, stage: str) -> None:
+    path = whole.artifacts / "poses/transforms.json"
+    path.write_text(path.read_text().replace("view_", "window_"))
+    whole.refuses(stage, "no photo in", "has a pose", "python -m stages.poses` again")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.update(images=[]),
+        lambda content: content["images"][0].update(name=3),
+        lambda content: content["images"][0].update(name="../view_0.png"),
+        lambda content: content["images"][0].update(width="240"),
+        lambda content: content["images"][0].update(height=0),
+        lambda content: content["images"][0].pop("turned"),
+    ],
+)
+def test_a_list_of_images_that_is_none(whole: Workshop, change: Callable[[Any], Any]) -> None:
+    path = whole.artifacts / "images/images.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    whole.refuses("attention", "images.json is not a list of images", "stages.ingest` again")
+
+
+@pytest.mark.parametrize(
+    ("stage", "name"),
+    [
+        ("refine", "masks/masks.json"),
+        ("render", "nerf/field.json"),
+        ("report", "metrics.json"),
+        ("report", "masks/masks.json"),
+        ("report", "poses/poses.json"),
+        ("report", "views/seen.json"),
+        ("evaluate", "poses/transforms.json"),
+    ],
+)
+def test_a_list_where_names_are_expected(whole: Workshop, stage: str, name: str) -> None:
+    (whole.artifacts / name).write_text("[1, 2]")
+    whole.refuses(stage, f"{name} is damaged: it holds a list")
+
+
+@pytest.mark.parametrize("bounds", [None, {"near": 1.0}, {"near": 1.0, "far": "away"}])
+def test_a_field_without_depths(whole: Workshop, bounds: Any) -> None:
+    path = whole.artifacts / "nerf/field.json"
+    content = json.loads(path.read_text()) | {"bounds": bounds}
+    path.write_text(json.dumps(content))
+    (whole.artifacts / "nerf/field.safetensors").touch()  # not the field that is still in memory
+    whole.refuses("render", "field.json tells no depths", "stages.nerf` again")
+
+
+@pytest.mark.parametrize(
+    "content", [b"rain\nrain\n", b"image\xff,rain\n1,2\n", b"image,step\n1,2,3\n"]
+)
+@pytest.mark.parametrize("name", ["metrics.csv", "nerf/fit.csv"])
+def test_tables_of_the_page_that_are_none(whole: Workshop, name: str, content: bytes) -> None:
+    (whole.artifacts / name).write_bytes(content)
+    whole.refuses("report", f"{name} is not a table with a column")
 
 
 @pytest.mark.parametrize("stage", ["masks", "refine"])

@@ -55,6 +55,15 @@ def test_json_keeps_no_nan_and_names_the_stage_to_run(tmp_path: Path) -> None:
     assert not (tmp_path / "a.json").exists()
     with pytest.raises(UserError, match=r"stages\.poses"):
         read_json(tmp_path / "a.json", made_by="poses")
-    (tmp_path / "a.json").write_text('{"cut": ')
-    with pytest.raises(UserError, match="damaged"):
-        read_json(tmp_path / "a.json", made_by="poses")
+    for damaged in ('{"cut": ', "[1, 2]", "3", "[" * 100_000):
+        (tmp_path / "a.json").write_text(damaged)
+        with pytest.raises(UserError, match="damaged"):
+            read_json(tmp_path / "a.json", made_by="poses")
+    (tmp_path / "b.json").mkdir()
+    with pytest.raises(UserError, match=r"b\.json cannot be read"):
+        read_json(tmp_path / "b.json")
+
+
+def test_json_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"w": 3}')
+    assert read_json(tmp_path / "a.json") == {"w": 3}
