@@ -14,6 +14,7 @@ FLOOR = 1e-3  # residuals below it are equal: 8-bit photos hold no less
 LARGEST_HOLE = 0.25  # of the drop around it
 SUREST = 0.02  # attention is never taken for more certain than this
 ATTENTION_WEIGHT = 1.0  # of its log-odds against the log of the residual
+SPILL = 0.15  # share of the strongest evidence nearby that a place has from its blur
 LEAST = 0.05  # the margin of a cell that only its neighbours turned
 UNKNOWN = 0.5  # the margin of a cell that keeps its old mask
 
@@ -42,6 +43,7 @@ def redraw(
     fewest_votes: int,
     *,
     reach: float,
+    spill: float,
     join: float,
     attention: np.ndarray | None = None,
 ) -> Redrawn:
@@ -49,9 +51,10 @@ def redraw(
 
     What counts is the logarithm of the residual over that of the clear surroundings within `reach`
     cells: a field is worse in foliage than on a road, and drops are smaller than either. The log-odds
-    of the gathered `attention`, where there is one, add to it. Otsu's threshold tells what surely is a
-    drop; what lies `join` of the way up to it from the clear median joins such a drop nearby. Then an
-    opening 3x3, and holes are filled: water has none.
+    of the gathered `attention`, where there is one, add to it. Blur carries the evidence of a drop over its
+    rim, that of a strong drop farther: of the sum, a share of the largest within `spill` cells is taken
+    off. Otsu's threshold tells what surely is a drop; what lies `join` of the way up to it from the clear
+    median joins such a drop nearby. Then an opening 3x3, and holes are filled: water has none.
     """
     known = np.isfinite(gathered) & (votes >= fewest_votes)
     if known.sum() < 2:
@@ -64,6 +67,7 @@ def redraw(
         odds = np.clip(np.nan_to_num(attention, nan=0.5), SUREST, 1 - SUREST)
         odds = np.log(odds / (1 - odds))
         score = above + ATTENTION_WEIGHT * (odds - np.median(odds[known]))
+    score = without_spill(score, known, spill)
     sure = otsu(score[known])
     middle = float(np.median(score[known & (score <= sure)]))
     begin = middle + join * (sure - middle)
@@ -74,7 +78,7 @@ def redraw(
     contrast = float("nan")
     if inside.size and outside.size:
         contrast = float(np.median(inside) / max(float(np.median(outside)), FLOOR))
-    level = float(np.exp(begin - middle))
+    level = float(np.exp((begin - middle) / (1 - SPILL)))
     way = np.clip((score - begin) / max(sure - middle, 1e-6), -1, 1)
     way = np.where(drop_mask, np.maximum(way, LEAST), np.minimum(way, -LEAST))
     margin = np.where(known, way, np.where(drop_mask, UNKNOWN, -UNKNOWN)).astype(np.float32)
@@ -93,6 +97,14 @@ def _above_surroundings(logs: np.ndarray, known: np.ndarray, reach: float) -> np
         above = logs - (around + 1e-3 * everywhere) / (share + 1e-3)
         clear = known & (above <= otsu(above[known]))
     return above
+
+
+def without_spill(score: np.ndarray, known: np.ndarray, radius: float) -> np.ndarray:
+    """`score` less `SPILL` times the largest score of the known cells in a disc around; itself included."""
+    lowest = np.where(known, score, score[known].min()).astype(np.float32)
+    steps = np.arange(-int(radius), int(radius) + 1)
+    disc = (steps[:, None] ** 2 + steps**2 <= radius**2).astype(np.uint8)
+    return score - np.float32(SPILL) * cv2.dilate(lowest, disc)
 
 
 def joined(wide: np.ndarray, seeds: np.ndarray) -> np.ndarray:

@@ -12,13 +12,14 @@ from pipeline.masking.masks import automatic_threshold, dilate, threshold
 from pipeline.masking.remask import Redrawn, redraw
 
 MEANS = 0.6  # of the threshold of single maps
-FEWEST_ON_PANE = 2  # votes, without attention; with it a single view's residual has its say too
-SHARE_ON_LENS = 0.25
+# Votes without attention; with it a single view's residual has its say too.
+FEWEST_ON_PANE, SHARE_ON_LENS = 2, 0.25
 # Where a drop begins, between the clear median (0) and Otsu's threshold (1). Later with attention, whose
 # log-odds fall off slowly around a drop, and latest on a pane, where what views still miss each other by
 # smears them.
-JOIN, JOIN_ON_LENS, JOIN_ON_PANE = 0.5, 0.75, 0.85
+JOIN, JOIN_ON_LENS, JOIN_ON_PANE = 0.4, 0.6, 0.7
 SURROUNDINGS = 20  # the longer side over this: how far around a place counts as its surroundings
+NEARBY = 90  # the longer side over this: how far the blur of residual and attention carries a drop's evidence
 
 
 class RedrawnViews(NamedTuple):
@@ -68,11 +69,12 @@ def redraw_views(
             gathered, votes = gather(glass, residuals, views, quantile) if apart else overall
             old, _ = gather(glass, [m.astype(np.float32) for m in drop_masks], views, None)
             seen = None if attentions is None else gather(glass, attentions, views, None)[0]
-            reach = max(drop_masks[0].shape) / SURROUNDINGS
+            longer = max(drop_masks[0].shape)
             previous = np.nan_to_num(old) > 0.5
             cache[views] = redraw(
-                gathered, votes, previous, fewest, reach=reach, join=join, attention=seen
-            )
+                gathered, votes, previous, fewest,
+                reach=longer / SURROUNDINGS, spill=longer / NEARBY, join=join, attention=seen,
+            )  # fmt: skip
         return cache[views]
 
     fresh, known = [], []
@@ -93,9 +95,9 @@ def redraw_views(
 
 def fewest_votes(glass: Glass, views: int, with_attention: bool) -> int:
     """How many of the `views` must look at a place of the glass for it to be redrawn."""
-    if isinstance(glass, PaneGlass):
-        return 1 if with_attention else FEWEST_ON_PANE
-    return max(2, round(SHARE_ON_LENS * views))
+    if with_attention:
+        return 1
+    return FEWEST_ON_PANE if isinstance(glass, PaneGlass) else max(2, round(SHARE_ON_LENS * views))
 
 
 def attention_on_glass(

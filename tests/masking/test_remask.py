@@ -8,9 +8,14 @@ import pytest
 
 from pipeline.masking.glass import LensGlass
 from pipeline.masking.masks import automatic_threshold, otsu
-from pipeline.masking.remask import opened, redraw, without_holes
+from pipeline.masking.remask import SPILL, opened, redraw, without_holes, without_spill
 from pipeline.masking.residual import exposure, residual
-from pipeline.masking.views import attention_on_glass, changed_share, redraw_views
+from pipeline.masking.views import (
+    attention_on_glass,
+    changed_share,
+    fewest_votes,
+    redraw_views,
+)
 
 
 def test_otsu_parts_two_heaps_in_their_middle() -> None:
@@ -57,7 +62,7 @@ def test_a_drop_is_where_the_residual_is_large_and_old_masks_stay_where_nobody_v
     gathered[:, 35:] = np.nan
     previous = np.zeros((30, 40), bool)
     previous[20:25, 28:38] = True
-    found = redraw(gathered, votes, previous, 2, reach=8, join=0.5)
+    found = redraw(gathered, votes, previous, 2, reach=8, spill=2, join=0.5)
     expected = np.zeros((30, 40), bool)
     expected[5:15, 5:15] = True
     expected[20:25, 30:38] = True
@@ -67,12 +72,65 @@ def test_a_drop_is_where_the_residual_is_large_and_old_masks_stay_where_nobody_v
     assert 1 < found.level < 10
 
 
+def test_evidence_spills_from_the_strongest_cell_nearby_by_hand() -> None:
+    score = np.zeros((7, 9), np.float32)
+    score[3, 3] = 10.0
+    score[3, 8] = 50.0
+    known = np.ones(score.shape, bool)
+    known[3, 8] = False
+    found = without_spill(score, known, 2.3)
+    expected = np.zeros(score.shape)
+    rows, columns = np.indices(score.shape)
+    expected[(rows - 3) ** 2 + (columns - 3) ** 2 <= 5] = -10 * SPILL  # a knight's move away, too
+    expected[3, 3] = 10 - 10 * SPILL
+    assert np.allclose(found[known], expected[known])
+    # Reaching no neighbour, every cell gives up the same share, and their order stays.
+    assert np.allclose(without_spill(score, known, 0.9)[known], (1 - SPILL) * score[known])
+
+
+def test_blur_carries_a_strong_drop_no_farther_over_its_rim_than_need_be() -> None:
+    rows, columns = np.indices((80, 160))
+    strong, faint = (np.hypot(rows - 40, columns - middle) < 12 for middle in (40, 120))
+    gathered = cv2.GaussianBlur(
+        (0.01 + 0.29 * strong + 0.05 * faint).astype(np.float32), (0, 0), 1.0
+    )
+    votes, nowhere = np.full(strong.shape, 9), np.zeros(strong.shape, bool)
+
+    def radii(spill: float) -> list[float]:
+        found = redraw(gathered, votes, nowhere, 1, reach=20, spill=spill, join=0.5).drop_mask
+        return [math.sqrt(half.sum() / math.pi) for half in (found[:, :80], found[:, 80:])]
+
+    (before, faint_before), (after, faint_after) = radii(0), radii(4.5)
+    assert faint_after < after < before  # and all of them beyond the true 11.8
+    assert faint_after > math.sqrt(faint.sum() / math.pi)
+    assert after - faint_after < 0.6 * (before - faint_before)
+
+
+def test_with_attention_one_vote_is_enough_and_without_it_more_must_look() -> None:
+    assert fewest_votes(LensGlass(4, 4), 21, with_attention=True) == 1
+    assert fewest_votes(LensGlass(4, 4), 21, with_attention=False) == 5
+    assert fewest_votes(LensGlass(4, 4), 3, with_attention=False) == 2
+    drop = np.zeros((30, 40), bool)
+    drop[8:20, 8:20] = True
+    residuals: list[np.ndarray | None] = []
+    for view in range(8):
+        values = np.where(drop, 0.1, 0.01).astype(np.float32)
+        values[:, :14] = values[:, :14] if view == 5 else np.nan  # half the drop: seen by one
+        residuals.append(values)
+    attentions = [np.where(drop, 0.8, 0.1).astype(np.float32)] * 8
+    old = [np.zeros(drop.shape, bool)] * 8
+    told = redraw_views(LensGlass(30, 40), residuals, old, quantile=0.5, attentions=attentions)
+    assert np.array_equal(told.drop_masks[0], drop)
+    alone = redraw_views(LensGlass(30, 40), residuals, old, quantile=0.5)
+    assert not alone.drop_masks[0][:, :14].any() and alone.drop_masks[0][8:20, 15:19].all()
+
+
 def test_cells_without_votes_do_not_eat_the_drop_around_them() -> None:
     rng = np.random.default_rng(0)
     wet = np.hypot(*(np.indices((60, 60)) - 30)) < 12
     gathered = np.where(wet, 0.1, 0.01 + 0.002 * rng.random(wet.shape)).astype(np.float32)
     votes = np.where(rng.random(wet.shape) < 0.4, 0, 9)  # scattered: no 3x3 square is without one
-    found = redraw(gathered, votes, wet, 2, reach=10, join=0.5)
+    found = redraw(gathered, votes, wet, 2, reach=10, spill=2, join=0.5)
     # But for corners that no 3x3 square fits into.
     assert (found.drop_mask & wet).sum() > 0.97 * wet.sum()
     assert not (found.drop_mask & ~wet).any()
@@ -81,7 +139,13 @@ def test_cells_without_votes_do_not_eat_the_drop_around_them() -> None:
 def test_without_any_votes_the_old_mask_stays() -> None:
     previous = np.eye(5, dtype=bool)
     found = redraw(
-        np.full((5, 5), np.nan, np.float32), np.zeros((5, 5)), previous, 1, reach=2, join=0.5
+        np.full((5, 5), np.nan, np.float32),
+        np.zeros((5, 5)),
+        previous,
+        1,
+        reach=2,
+        spill=1,
+        join=0.5,
     )
     assert np.array_equal(found.drop_mask, previous)
     assert math.isnan(found.contrast)
@@ -175,7 +239,7 @@ def test_rims_run_between_cells() -> None:
     assert roundness(found.drop_masks[0]) > 0.97
     cells = redraw(
         glass.from_view(0, residuals[0]), np.full((16, 16), 3), np.zeros((16, 16), bool), 1,
-        reach=3.2, join=0.5,
+        reach=3.2, spill=1, join=0.5,
     )  # fmt: skip
     assert np.array_equal(cells.margin > 0, cells.drop_mask)
     blocks = np.kron(cells.drop_mask, np.ones((4, 4), bool))
