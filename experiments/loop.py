@@ -4,8 +4,9 @@
     python -m experiments.loop --run --params params.yaml demo  # runs the stage first
 
 One line per scene and round: the glass, the share of pixels dropped, precision, recall and IoU against the
-true coverage (> 0.05), and the PSNR of held-out views of the brief fit on the round's masks. `masks` is what
-the detector drew. For a scene without drops every dropped pixel is a false alarm: the share is what counts.
+true coverage (> 0.05, or `--covered`), and the PSNR of held-out views of the brief fit on the round's
+masks. `masks` is what the detector drew. For a scene without drops every dropped pixel is a false alarm: the
+share is what counts.
 `--picture FILE` also draws the middle photo of each scene beside its final mask.
 """
 
@@ -32,8 +33,8 @@ COVERED = 0.05
 FOUND, TOO_MUCH, MISSED = (0.0, 0.8, 0.0), (0.9, 0.0, 0.0), (0.1, 0.1, 1.0)
 
 
-def table(root: Path, scene: str) -> list[str]:
-    """The lines of one scene."""
+def table(root: Path, scene: str, covered: float = COVERED) -> list[str]:
+    """The lines of one scene; a pixel is wet where its coverage is above `covered`."""
     paths = ScenePaths(root, scene)
     records = read_images_json(paths.images)
     clean = find_references(paths.truth / "clean", records) or {}
@@ -50,11 +51,11 @@ def table(root: Path, scene: str) -> list[str]:
         shares.append(float(drop_mask.mean()))
         if one.coverage is not None:
             true = read_reference(one.coverage, one.record, one.source)[..., 0]
-            counts.append(mask_counts(drop_mask, true, COVERED))
+            counts.append(mask_counts(drop_mask, true, covered))
     drawn = {"coverage": float(np.mean(shares))}
     drawn |= mask_scores(counts)._asdict() if counts else {}
     lines = [_line(scene, "masks", drawn, "")]
-    for number, numbers in score_rounds(paths.refine, files, COVERED).items():
+    for number, numbers in score_rounds(paths.refine, files, covered).items():
         told = about["rounds"][number]
         window = f", over {told['window']} neighbours" if told.get("window") else ""
         lines.append(_line(scene, number, numbers, told["glass"] + window))
@@ -89,6 +90,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
+    parser.add_argument(
+        "--covered", type=float, default=COVERED, help="true coverage of a wet pixel"
+    )
     parser.add_argument("--run", action="store_true", help="run stages.refine of each scene first")
     parser.add_argument("--picture", type=Path, help="of scenes of one size, one below the other")
     flags = parser.parse_args()
@@ -99,7 +103,7 @@ def main() -> None:
         if flags.run:
             command = [sys.executable, "-m", "stages.refine", "--scene", scene]
             subprocess.run([*command, "--params", str(flags.params)], check=True)
-        print("\n".join(table(flags.params.resolve().parent, scene)), flush=True)
+        print("\n".join(table(flags.params.resolve().parent, scene, flags.covered)), flush=True)
     if flags.picture:
         root = flags.params.resolve().parent
         rows = [as_bytes(picture(root, scene)) for scene in flags.scenes]
