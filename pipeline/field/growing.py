@@ -18,6 +18,10 @@ from pipeline.io.images import resized
 from pipeline.io.posed import PosedImage
 
 FAR_FACTOR = 2.0  # the world ends this far beyond the farthest sparse point
+BRIEF: dict[str, Any] = {
+    "distortion": 0.002,
+    "decay": 0.1,
+}  # as the final fit has them; they help short fits more
 ALIGN_RAYS = 1024  # per step of the fits that cameras are aligned to
 ALIGN_STEPS = 2  # of each camera between two fits
 
@@ -47,7 +51,8 @@ class GrowingField:
         self.near = min(image.view.near for image in images)
         self.far = max(image.view.far for image in images) * far_factor
         views = [image.view for image in images]
-        self.field = build_around("fast", views, self.near, self.far, seed=seed).to(device)
+        field = build_around("fast", views, self.near, self.far, seed=seed, **BRIEF)
+        self.field = field.to(device)
         self.psnr: list[float] = []
 
     def fit(

@@ -15,6 +15,12 @@ from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.paper_field import PaperConfig, PaperField
 from pipeline.geometry.spaces import Space, fit_space
 
+# A contracted space holds all that is around the cameras: what they look at fills about a quarter of its sides,
+# and a ray finds the surface with fewer of its samples.
+CONTRACTED_FINER = 4
+CONTRACTED_SAMPLES = 32
+CONTRACTED_BINS = 64
+
 
 class Camera(Protocol):
     """What a field needs of a view: ``cam_from_world`` ``(4, 4)``, fx, fy, cx, cy, k1, the size."""
@@ -51,9 +57,17 @@ def scene_space(
 
 
 def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:
-    """``coarse``, ``fine`` and ``proposal`` vertices per axis: ``fine`` along the longer side."""
+    """``coarse``, ``fine`` and ``proposal`` vertices per axis.
+
+    ``fine`` along the longer side of what the cameras look at, which in a contracted space is a quarter of
+    the cube.
+    """
     if space.kind == "contract":
-        return {"coarse": (24,) * 3, "fine": (fine,) * 3, "proposal": (96,) * 3}
+        return {
+            "coarse": (24,) * 3,
+            "fine": (CONTRACTED_FINER * fine,) * 3,
+            "proposal": (96,) * 3,
+        }
     width, height = (space.high[i] - space.low[i] for i in range(2))
     longest = max(width, height)
 
@@ -102,7 +116,7 @@ def build_around(
     ``space`` as in :func:`scene_space`; ``resolution`` vertices of the fast field's finest grid
     along the longer side; ``precision`` of the fast field's products on a CPU is float32, bfloat16 or
     auto: the latter where it is fast. ``config`` overrides fields of GridConfig (the paper's has none
-    here).
+    here); samples and bins are raised to what a contracted space needs.
     """
     cams = np.stack([camera.cam_from_world for camera in cameras])
     intrinsics = np.array([camera.intrinsics for camera in cameras])
@@ -111,7 +125,11 @@ def build_around(
     if model == "paper":
         return build("paper", {}, around, seed)
     half = half_is_fast() if precision == "auto" else precision == "bfloat16"
-    return build("fast", config | grid_sizes(around, resolution) | {"half": half}, around, seed)
+    config = config | grid_sizes(around, resolution) | {"half": half}
+    if around.kind == "contract":
+        config["samples"] = max(config.get("samples", GridConfig.samples), CONTRACTED_SAMPLES)
+        config["bins"] = max(config.get("bins", GridConfig.bins), CONTRACTED_BINS)
+    return build("fast", config, around, seed)
 
 
 def describe(field: GridField | PaperField) -> dict[str, Any]:

@@ -234,6 +234,28 @@ def test_products_are_of_the_precision_asked_for(
     assert record.rows[-1][2] > record.rows[0][2] + 0.5
 
 
+def test_cameras_all_around_get_as_fine_a_grid_and_more_samples() -> None:
+    class Camera:
+        width, height, intrinsics = 400, 300, (350.0, 350.0, 200.0, 150.0, 0.0)
+
+        def __init__(self, angle: float) -> None:
+            # Around the y axis, four units from it, looking at it.
+            c, s = np.cos(angle), np.sin(angle)
+            self.cam_from_world = np.array(
+                [[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, 4], [0, 0, 0, 1]]
+            )
+
+    cameras = [Camera(angle) for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
+    model = build_around("fast", cameras, 2.0, 1e6, resolution=768, samples=16, table_log2=10)
+    assert isinstance(model, GridField)
+    assert model.space.kind == "contract"
+    assert model.config.samples == 32
+    assert model.config.bins == 64
+    # A pixel is 4/350 wide where they look; the unit ball reaches to the cameras.
+    step = (model.space.high[0] - model.space.low[0]) * 4.0 / (model.config.fine[0] - 1)
+    assert 1.0 < 4.0 / 350.0 / step < 3.0
+
+
 def test_a_loss_that_is_not_finite_stops_with_step_and_knob(photos: list[PosedPhoto]) -> None:
     model = field(photos)
     with torch.no_grad():
