@@ -21,7 +21,7 @@ import filelock
 from tqdm import tqdm
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import disk_fault, disk_faults
+from pipeline.io.atomic import disk_fault, disk_faults, place_fault
 from pipeline.io.paths import SHARED, ScenePaths
 from pipeline.params import Section, read_folders, read_section
 
@@ -176,7 +176,8 @@ def _logged(name: str, stage: Callable[[], str | None], work: Path) -> str | Non
         return stage()
     except Exception as error:
         log.error("stage %s failed", name, exc_info=True)
-        fault = None if isinstance(error, UserError) else disk_fault(work)
+        known = isinstance(error, UserError)
+        fault = None if known else disk_fault(work) or place_fault(error, work.parents[1])
         if fault is None:
             raise
         raise fault from error

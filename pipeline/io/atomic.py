@@ -17,6 +17,12 @@ import numpy as np
 
 from pipeline.errors import UserError
 
+# Of places rather than of programs: who looks at the file or folder that is named can mend it.
+_PLACES = (
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG,
+    errno.ELOOP,
+)  # fmt: skip
+
 
 def _disk_error(error: OSError, path: Path) -> UserError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -24,8 +30,26 @@ def _disk_error(error: OSError, path: Path) -> UserError | None:
             f"{path}: the disk is full.",
             "Free some space and run again; older results are untouched.",
         )
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return UserError(f"{path}: cannot be written ({error.strerror}).", "Check its permissions.")
+    if error.errno in _PLACES:
+        place = (
+            Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else path
+        )
+        what = f"{place}: cannot be read ({error.strerror})."
+        if place.is_relative_to(path.parent):
+            what = f"{place}: cannot be written ({error.strerror})."
+        return UserError(what, "Check its permissions, kind and name.")
+    return None
+
+
+def place_fault(error: BaseException | None, folder: Path) -> UserError | None:
+    """The fault of a file or folder that may not be read or written, behind `error`; None for others.
+
+    What lies beside `folder` is written by its stage, everything else is read.
+    """
+    while error is not None:
+        if isinstance(error, OSError) and (fault := _disk_error(error, folder)):
+            return fault
+        error = error.__cause__ or error.__context__
     return None
 
 

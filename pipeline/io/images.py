@@ -17,7 +17,7 @@ from pipeline.errors import UserError
 from pipeline.io.atomic import write_bytes
 
 PHOTO_SUFFIXES = frozenset(
-    {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif"}
+    {".jpg", ".jpeg", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif"}
 )
 MAX_PIXELS = 200_000_000
 # EXIF orientation -> degrees counter-clockwise that make the stored pixels upright. The mirrored codes
@@ -93,8 +93,8 @@ def can_read(suffix: str) -> bool:
 def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
     """The stored pixels of a user's photo, (H, W, 3) uint8 RGB as the sensor saw them, and its metadata.
 
-    Grey, palette, RGBA (over black), CMYK and 16-bit files are converted to 8-bit RGB. UserError for what
-    is not an image, is cut short, or has more than MAX_PIXELS.
+    Grey, palette, RGBA (over black), CMYK, 16-bit and grey float files are converted to 8-bit RGB. UserError
+    for what is not an image, is cut short, or has more than MAX_PIXELS.
     """
     can_read(path.suffix.lower())  # registers what reads HEIC, once in every process
     try:
@@ -114,6 +114,10 @@ def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
         raise UserError(
             f"{path} is not an image that can be read.", "Remove it, or convert it to JPEG or PNG."
         ) from None
+    except PermissionError as error:
+        raise UserError(
+            f"{path} cannot be read ({error.strerror}).", "Check its permissions."
+        ) from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UserError(
             f"{path} is damaged or cut short ({error}).", "Copy it again, or remove it."
@@ -122,8 +126,10 @@ def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
 
 def _sensor_pixels(photo: Image.Image) -> np.ndarray:
     if photo.mode.startswith(("I", "F")):
-        values = np.asarray(photo).astype(np.float64)
+        values = np.nan_to_num(np.asarray(photo).astype(np.float64))
         scale = 255.0 / 65535.0 if values.max() > 255 else 1.0
+        if photo.mode == "F" and values.max() <= 1:
+            scale = 255.0
         grey = np.rint(np.clip(values * scale, 0, 255)).astype(np.uint8)
         pixels = np.repeat(grey[..., None], 3, axis=2)
     elif photo.has_transparency_data:

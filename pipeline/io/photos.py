@@ -60,7 +60,8 @@ def list_photos(folder: Path, at_least: int) -> dict[str, Path]:
     """The photos in `folder` (its top level only) by the name their image will have, in name order.
 
     UserError when the folder is missing or holds fewer than `at_least` photos, when two photos would get
-    one name, and for files that look like photos but are of a kind that cannot be read.
+    one name, and for files that look like photos but are of a kind that cannot be read; a raw file beside
+    its JPEG is passed over.
     """
     if not folder.is_dir():
         raise UserError(
@@ -71,8 +72,10 @@ def list_photos(folder: Path, at_least: int) -> dict[str, Path]:
         for path in sorted(folder.iterdir())
         if not path.name.startswith(".") and (path.is_file() or path.is_symlink())
     ]
+    developed = {path.stem for path in files if path.suffix.lower() in PHOTO_SUFFIXES}
     for path in files:
-        _refuse_unreadable_kind(path)
+        if path.suffix.lower() not in RAW_SUFFIXES or path.stem not in developed:
+            _refuse_unreadable_kind(path)
     photos = by_image_name(path for path in files if path.suffix.lower() in PHOTO_SUFFIXES)
     if len(photos) < at_least:
         found = {0: "no photos", 1: "one photo only"}.get(len(photos), f"{len(photos)} photos only")

@@ -60,8 +60,8 @@ class Origin:
 
 
 def image_name(photo: Path) -> str:
-    """The file name in `images/` of a photo: its stem without blanks, as PNG."""
-    stem = re.sub(r"[\s/\\:*?\"<>|]+", "_", photo.stem)
+    """The file name in `images/` of a photo: its stem without blanks and what is no text, as PNG."""
+    stem = re.sub(r"[\s/\\:*?\"<>|\ud800-\udfff]+", "_", photo.stem)
     stem = "_" + stem[1:] if stem.startswith(("-", ".")) else stem
     return f"{stem}_.png" if stem in RESERVED_STEMS else f"{stem}.png"
 

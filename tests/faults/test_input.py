@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import zlib
 from pathlib import Path
@@ -89,7 +90,7 @@ def test_a_link_to_nowhere(photos: Workshop) -> None:
     photos.refuses("ingest", str(path))
 
 
-@pytest.mark.parametrize("name", ["view_0.heic", "view_0.dng", "walk.mp4"])
+@pytest.mark.parametrize("name", ["view_9.heic", "view_9.dng", "walk.mp4"])
 def test_kinds_that_are_not_read(photos: Workshop, name: str) -> None:
     (photos.data / name).write_bytes(b"whatever")
     photos.refuses("ingest", name)
@@ -110,6 +111,33 @@ def test_what_lies_about_in_folders_of_photos_is_no_fault(photos: Workshop) -> N
     done = photos.run("ingest")
     assert done.code == 0, done.said
     assert len(list((photos.artifacts / "images").glob("*.png"))) == 9
+
+
+def test_names_of_other_alphabets_and_none(photos: Workshop) -> None:
+    """What is no UTF-8 in a name becomes an image of another, and everything else can be written."""
+    first, second = _photos(photos)[:2]
+    first.rename(first.with_name(os.fsdecode(b"stra\xdfe.png")))
+    second.rename(second.with_name('it\'s "wet" & 100%.png'))
+    assert photos.run("ingest").code == 0
+    names = sorted(path.name for path in (photos.artifacts / "images").glob("*.png"))
+    assert names[:2] == ["it's_wet_&_100%.png", "stra_e.png"]
+    assert all(name.encode() for name in names)
+
+
+def test_a_name_longer_than_files_may_have(photos: Workshop) -> None:
+    first = _photos(photos)[0]
+    first.rename(first.with_name("x" * 250 + ".png"))
+    photos.refuses("ingest", "xxx", "File name too long")
+
+
+@pytest.mark.parametrize("place", ["artifacts", "artifacts/.work", f"artifacts/{SCENE}"])
+def test_a_file_where_a_folder_is_wanted(photos: Workshop, place: str) -> None:
+    path = photos.root / place
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("")
+    outcome = photos.run("ingest")
+    assert outcome.code == 2, outcome.said
+    assert "cannot be written" in outcome.said and "Traceback" not in outcome.said
 
 
 # --- parameters ----------------------------------------------------------------------------------

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import disk_faults, publish_dir, read_json, write_bytes, write_json
+from pipeline.io.atomic import (
+    disk_faults,
+    place_fault,
+    publish_dir,
+    read_json,
+    write_bytes,
+    write_json,
+)
 
 
 def test_a_published_folder_replaces_the_old_one_whole(tmp_path: Path) -> None:
@@ -67,3 +74,17 @@ def test_json_keeps_no_nan_and_names_the_stage_to_run(tmp_path: Path) -> None:
 def test_json_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"w": 3}')
     assert read_json(tmp_path / "a.json") == {"w": 3}
+
+
+def test_what_may_not_be_read_is_not_called_unwritable(tmp_path: Path) -> None:
+    """The source of a copy into a folder that is being written."""
+    source = tmp_path / "photos" / "a.jpg"
+    told = pytest.raises(UserError, match=r"a\.jpg: cannot be read \(Permission denied\)")
+    with told, publish_dir(tmp_path / "data" / "scene"):
+        raise PermissionError(errno.EACCES, "Permission denied", str(source))
+    behind = RuntimeError("copying failed")
+    behind.__cause__ = PermissionError(errno.EACCES, "Permission denied", str(source))
+    fault = place_fault(behind, tmp_path / "data" / "scene")
+    assert fault is not None and "cannot be read" in fault.what
+    assert place_fault(RuntimeError("a defect"), tmp_path) is None
+    assert place_fault(FileNotFoundError(errno.ENOENT, "none", "a"), tmp_path) is None

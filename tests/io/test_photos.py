@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,25 @@ def test_every_kind_of_pixel_becomes_rgb(tmp_path: Path, mode: str) -> None:
     assert pixels.min() >= 250
 
 
+def test_grey_floats_between_0_and_1_are_no_black_photo(tmp_path: Path) -> None:
+    ramp = np.linspace(0, 1, 11, dtype=np.float32).reshape(1, 11)
+    for name, top in (("one.tif", 1), ("bytes.tif", 255), ("words.tif", 65535)):
+        Image.fromarray(ramp * top).save(tmp_path / name)
+        pixels, _ = read_photo(tmp_path / name)
+        assert np.abs(pixels[0, :, 0] - 255 * ramp[0]).max() <= 0.5 + 1e-3, name
+
+
+def test_a_photo_that_may_not_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(path: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Image, "open", forbidden)
+    with pytest.raises(UserError, match=r"a\.jpg cannot be read \(Permission denied\)"):
+        read_photo(tmp_path / "a.jpg")
+
+
 def test_what_is_no_photo_is_named(tmp_path: Path) -> None:
     (tmp_path / "text.jpg").write_text("not a photo")
     with pytest.raises(UserError, match=r"text\.jpg is not an image"):
@@ -166,6 +186,8 @@ def test_the_folder_is_listed_by_the_names_images_will_have(tmp_path: Path) -> N
     (tmp_path / "truth").mkdir()
     assert list(list_photos(tmp_path, 1)) == ["a.png", "b_two.png", "mean_.png"]
     assert image_name(Path("-x.jpg")) == "_x.png"
+    latin = os.fsdecode(b"caf\xe9.jpg")  # a name that is no UTF-8
+    assert image_name(Path(latin)) == "caf_.png"
     with pytest.raises(UserError, match="3 photos only"):
         list_photos(tmp_path, 4)
     _photo(tmp_path / "a.png")
@@ -184,5 +206,8 @@ def test_photos_in_a_subfolder_are_pointed_at(tmp_path: Path) -> None:
 
 def test_raw_files_name_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "a.dng").touch()
-    with pytest.raises(UserError, match="Convert them to JPEG"):
+    _photo(tmp_path / "b.jpg")
+    with pytest.raises(UserError, match=r"a\.dng.*Convert them to JPEG"):
         list_photos(tmp_path, 1)
+    _photo(tmp_path / "a.JPG")
+    assert list(list_photos(tmp_path, 1)) == ["a.png", "b.png"], "cameras can store both"
