@@ -47,8 +47,13 @@ def read_section(
         raise UserError(f"{file.name}: " + "; ".join(problems) + ".", CORRECT) from None
 
 
-def read_params(file: Path) -> dict[str, Any]:
-    """params.yaml as DVC reads it (YAML 1.2); UserError when missing, malformed or with unknown sections."""
+def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """params.yaml as DVC reads it (YAML 1.2); UserError when missing, malformed or with unknown sections.
+
+    `above` are the files that build on this one.
+    """
+    if file.resolve() in above:
+        raise UserError(f"{file} builds on itself ({BASE}: {above[-1]} names it).", CORRECT)
     try:
         content = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
     except OSError as error:
@@ -59,7 +64,8 @@ def read_params(file: Path) -> dict[str, Any]:
     known = (*stage_names(), *OTHER_SECTIONS, BASE)
     _refuse_unknown(file, "section", content, known)
     if BASE in content:
-        content = _upon(file, read_params(file.parent / str(content[BASE])), content)
+        below = read_params(file.parent / str(content[BASE]), (*above, file.resolve()))
+        content = _upon(file, below, content)
     for kind in ("scenes", "variants"):
         if not content.get(kind):
             continue

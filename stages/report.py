@@ -52,8 +52,8 @@ def main(job: Job, params: Params) -> str:
     film, film_missing = gather.video(paths.views / "path.mp4")
     page = Page(
         scene=job.scene,
-        headline=numbers.headline(metrics, other),
-        tiles=numbers.tiles(metrics, other),
+        headline=numbers.headline(metrics, other, params.compare),
+        tiles=numbers.tiles(metrics, other, params.compare),
         table=numbers.table(metrics, other),
         compared=params.compare if other else "",
         photos=_photos(paths, records, pictures, dict(lost)),

@@ -170,6 +170,9 @@ def test_a_file_may_build_on_another(tmp_path: Path) -> None:
     above.write_text("base: nowhere.yaml\n")
     with pytest.raises(UserError, match=r"nowhere\.yaml cannot be read"):
         read_params(above)
+    above.write_text("base: params.yaml\n")
+    with pytest.raises(UserError, match="builds on itself"):
+        read_params(above)
 
 
 def test_a_variant_may_find_folders_elsewhere(tmp_path: Path) -> None:

@@ -95,7 +95,9 @@ def publish_dir(final: Path) -> Iterator[Path]:
         final.parent.mkdir(parents=True, exist_ok=True)
         for leftover in final.parent.glob(f".{final.name}.tmp-*"):
             shutil.rmtree(leftover, ignore_errors=True)
-        fresh = final.parent / f".{final.name}.tmp-{os.getpid()}"
+        # A name never used before: workers that live on remember files by their paths, and in
+        # containers every run may have the same process id.
+        fresh = final.parent / f".{final.name}.tmp-{os.getpid()}-{os.urandom(4).hex()}"
         fresh.mkdir()
         try:
             yield fresh

@@ -90,19 +90,22 @@ def unmet(scene: str, variant: str) -> list[tuple[str, str]]:
     return [(reason, "the comparison")]
 
 
+def called(variant: str) -> str:
+    """What the page calls the fit to compare with: that of the shipped parameters by what it is."""
+    return "the same field fitted without masks" if variant == "unmasked" else f"the fit {variant}"
+
+
 def tiles(
-    metrics: Mapping[str, Any], other: Mapping[str, Any] | None
+    metrics: Mapping[str, Any], other: Mapping[str, Any] | None, variant: str = "unmasked"
 ) -> list[tuple[str, str, str]]:
-    """The few numbers that matter: (number, unit, what it is)."""
+    """The few numbers that matter: (number, unit, what it is). `other` are those of the fit `variant`."""
     found: list[tuple[str, str, str]] = []
     test, photo = value(metrics, "test.psnr"), value(metrics, "input.psnr")
     theirs = value(other, "test.psnr") if other else None
     if test is not None:
         found.append((f"{test:.1f}", "dB", "held-out views against clean references"))
         if theirs is not None:
-            found.append(
-                (f"{test - theirs:+.1f}", "dB", "over the same field fitted without masks")
-            )
+            found.append((f"{test - theirs:+.1f}", "dB", f"over {called(variant)}"))
     elif (kept := value(metrics, "selfcheck.kept_psnr")) is not None:
         found.append((f"{kept:.1f}", "dB", "held-out views against the photos, beside the drops"))
     mixed = value(metrics, "composite.psnr")
@@ -119,8 +122,10 @@ def tiles(
     return found
 
 
-def headline(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> str:
-    """What came out, in one or two sentences."""
+def headline(
+    metrics: Mapping[str, Any], other: Mapping[str, Any] | None, variant: str = "unmasked"
+) -> str:
+    """What came out, in one or two sentences. `other` are the numbers of the fit `variant`."""
     poses = (
         f"{value(metrics, 'poses.registered')} of {value(metrics, 'poses.total')} photos placed."
     )
@@ -134,7 +139,7 @@ def headline(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> str
     theirs = value(other, "test.psnr") if other else None
     if theirs is not None:
         word = "better" if test >= theirs else "worse"
-        text += f", {abs(test - theirs):.1f} dB {word} than the same field fitted without masks"
+        text += f", {abs(test - theirs):.1f} dB {word} than {called(variant)}"
     return f"{text}. {poses}"
 
 

@@ -13,8 +13,6 @@ from pipeline.errors import UserError
 from pipeline.io.transforms import View
 from pipeline.sfm.model import points_of
 
-UNDISTORT_STEPS = 50
-
 
 def read_sparse(folder: Path) -> pycolmap.Reconstruction:
     """The model that the stage `poses` wrote; UserError when missing or damaged."""

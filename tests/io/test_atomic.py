@@ -45,6 +45,15 @@ def test_leftovers_of_a_killed_run_are_cleared(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["masks"]
 
 
+def test_a_folder_is_written_under_another_name_each_time(tmp_path: Path) -> None:
+    """By one process too: a worker that lives on must not take new files for those it remembers."""
+    names = set()
+    for _ in range(3):
+        with publish_dir(tmp_path / "views") as fresh:
+            names.add(fresh.name)
+    assert len(names) == 3
+
+
 def test_a_file_appears_whole(tmp_path: Path) -> None:
     write_bytes(tmp_path / "deep" / "a.bin", b"abc")
     assert (tmp_path / "deep" / "a.bin").read_bytes() == b"abc"

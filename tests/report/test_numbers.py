@@ -45,3 +45,12 @@ def test_without_references_nothing_is_claimed():
     sentence = headline(blind, {})
     assert "cannot be judged under the drops" in sentence and "27.3 dB" in sentence
     assert all("clean references" not in text for _, _, text in tiles(blind, {}))
+
+
+def test_only_the_fit_without_masks_is_called_so() -> None:
+    assert ("+6.5", "dB", "over the fit paper") in tiles(OWN, OTHER, "paper")
+    assert headline(OWN, OTHER).endswith(
+        "than the same field fitted without masks. 23 of 24 photos placed."
+    )
+    told = headline(OWN, OTHER, "paper")
+    assert "than the fit paper." in told and "without masks" not in told
