@@ -104,8 +104,9 @@ def _before(params_file: Path, flags: argparse.Namespace) -> None:
     if flags.source is None:
         return
     data = ScenePaths(params_file.parent, flags.scene).data
-    text = with_scene(params_file, flags.scene)
+    with_scene(params_file, flags.scene)  # what stands against it is told before anything is copied
     adopt(flags.source, data, FEWEST, read_colmap)
+    text = with_scene(params_file, flags.scene)  # anew: copying takes long, others add scenes too
     if text is not None:
         write_text(params_file, text)
         print(f"ingest: added the scene {flags.scene} to {params_file}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import subprocess
@@ -173,3 +174,19 @@ def test_one_command_brings_a_folder_in(tmp_path: Path) -> None:
     bad = _from(root, "shed", tmp_path / "nowhere")
     assert bad.returncode == 2 and "no folder and no video" in bad.stderr
     assert (root / "params.yaml").read_text() == after and not (root / "data/shed").exists()
+
+
+def test_scenes_that_are_added_at_once_do_not_lose_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the photos of one are copied, another finishes and writes its line."""
+    file = tmp_path / "params.yaml"
+    file.write_text("scene_defaults: &scene {ingest: {}}\nscenes:\n  demo: {<<: *scene}\n")
+
+    def adopt(*_: object) -> None:
+        file.write_text(file.read_text() + "  pier: {<<: *scene}\n")
+
+    monkeypatch.setattr(ingest, "adopt", adopt)
+    ingest._before(file, argparse.Namespace(source=tmp_path, scene="garden"))
+    added = file.read_text().splitlines()[-2:]
+    assert added == ["  pier: {<<: *scene}", "  garden: {<<: *scene}"]
