@@ -35,7 +35,7 @@ def _disk_error(error: OSError, path: Path) -> UserError | None:
             Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else path
         )
         what = f"{place}: cannot be read ({error.strerror})."
-        if place.is_relative_to(path.parent):
+        if place.is_relative_to(path.parent) or path.is_relative_to(place):
             what = f"{place}: cannot be written ({error.strerror})."
         return UserError(what, "Check its permissions, kind and name.")
     return None

@@ -97,3 +97,9 @@ def test_what_may_not_be_read_is_not_called_unwritable(tmp_path: Path) -> None:
     assert fault is not None and "cannot be read" in fault.what
     assert place_fault(RuntimeError("a defect"), tmp_path) is None
     assert place_fault(FileNotFoundError(errno.ENOENT, "none", "a"), tmp_path) is None
+
+
+def test_a_folder_above_that_takes_nothing_is_called_unwritable() -> None:
+    told = pytest.raises(UserError, match=r"/a: cannot be written \(Read-only file system\)")
+    with told, disk_faults(Path("/a/b/c/d")):
+        raise OSError(errno.EROFS, "Read-only file system", "/a")
