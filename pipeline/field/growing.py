@@ -18,11 +18,8 @@ from pipeline.io.images import resized
 from pipeline.io.posed import PosedImage
 
 FAR_FACTOR = 2.0  # the world ends this far beyond the farthest sparse point
-BRIEF: dict[str, Any] = {
-    "distortion": 0.002,
-    "decay": 0.1,
-}  # as the final fit has them; they help short fits more
 ALIGN_RAYS = 1024  # per step of the fits that cameras are aligned to
+ALIGN_FIELD: dict[str, Any] = {"distortion": 0.002, "decay": 0.1}  # as the final fit has them
 ALIGN_STEPS = 2  # of each camera between two fits
 
 Each = Callable[[Callable[..., Any], Mapping[str, tuple[Any, ...]]], dict[str, Any]]
@@ -40,18 +37,23 @@ def scaled_image(image: PosedImage, scale: float) -> PosedImage:
 class GrowingField:
     """The fast field of a scene, each fit warm-started from the one before.
 
-    `near` and `far` bound it: those of the images' sparse points, `far` times `far_factor`. `psnr` is the
-    training PSNR at the end of each fit.
+    `near` and `far` bound it: those of the images' sparse points, `far` times `far_factor`; `config` overrides
+    the field's own as in :func:`build_around`. `psnr` is the training PSNR at the end of each fit.
     """
 
     def __init__(
-        self, images: Sequence[PosedImage], far_factor: float, seed: int, device: str
+        self,
+        images: Sequence[PosedImage],
+        far_factor: float,
+        seed: int,
+        device: str,
+        **config: Any,
     ) -> None:
         self.images, self.seed, self.device = list(images), seed, device
         self.near = min(image.view.near for image in images)
         self.far = max(image.view.far for image in images) * far_factor
         views = [image.view for image in images]
-        field = build_around("fast", views, self.near, self.far, seed=seed, **BRIEF)
+        field = build_around("fast", views, self.near, self.far, seed=seed, **config)
         self.field = field.to(device)
         self.psnr: list[float] = []
 
@@ -145,7 +147,7 @@ def aligned_poses(
     function over tasks by name. Held-out images are moved too, but never fitted.
     """
     smaller = [scaled_image(image, scale) for image in images]
-    field = GrowingField(smaller, FAR_FACTOR, seed, device)
+    field = GrowingField(smaller, FAR_FACTOR, seed, device, **ALIGN_FIELD)
     drop_masks = {image.record.name: ~image.keep_mask for image in smaller}
     for steps in fits:
         field.fit(drop_masks, steps, ALIGN_RAYS, threads)
