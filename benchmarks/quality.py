@@ -160,7 +160,12 @@ def _true_views(truth: Path, stems: list[str], sfm: dict[str, View]) -> dict[str
 
 
 def measure(
-    scene: Scene, row: str, settings: dict[str, Any], threads: int, seen: dict[str, np.ndarray]
+    scene: Scene,
+    row: str,
+    settings: dict[str, Any],
+    threads: int,
+    seen: dict[str, np.ndarray],
+    device: str = "cpu",
 ) -> Result:
     """Fit one row's input and compare the held-out views; ``seen`` masks by stem, may be empty."""
     kind, masks, poses = ROWS[row]
@@ -184,20 +189,23 @@ def measure(
             PosedPhoto(stem, image, keep_mask, view.cam_from_world, view.intrinsics, near, far)
         )
     config = {key: settings[key] for key in FIELD}
-    field = build_around("fast", list(views.values()), near, far, **config)
-    buffer = RayBuffer(photos, settings["seed"])
-    begin = time.process_time()
+    field = build_around("fast", list(views.values()), near, far, **config).to(device)
+    buffer = RayBuffer(photos, settings["seed"], device)
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    begin = clock()
     fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
         seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
         average=settings["average"],
-        threads=threads)  # fmt: skip
-    seconds = time.process_time() - begin
+        shards=2 if device == "cpu" else 1, threads=threads)  # fmt: skip
+    seconds = clock() - begin
     torch.set_num_threads(threads)
     renders = {}
     for stem in stems if not seen else held_out:
         view = views[stem]
         size = (view.width, view.height)
-        renders[stem] = render_view(field, view.cam_from_world, view.intrinsics, size, near, far)
+        renders[stem] = render_view(
+            field, view.cam_from_world, view.intrinsics, size, near, far, device=device
+        )
     errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
     whole = np.mean([_psnr(error) for error in errors.values()])
     inside = [_psnr(errors[stem][seen[stem]]) for stem in held_out] if seen else [np.nan]
@@ -235,6 +243,7 @@ def main() -> None:
     parser.add_argument("--artifacts", type=Path, default=ROOT / "artifacts")
     parser.add_argument("--rows", default=",".join(ROWS))
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--steps", type=int, help="instead of params.yaml's")
     parser.add_argument("--shrink", type=int, default=1, help="photos so many times smaller")
     parser.add_argument("--set", nargs="*", default=[], help="other parameters, key=value")
@@ -248,14 +257,14 @@ def main() -> None:
         print(f"{folder.name}: {len(scene.rainy)} views, {covered:.1%} covered, "
               f"{settings['steps']} steps of {settings['batch_rays']} rays")  # fmt: skip
         print(f"{'photos':6} {'masks':8} {'poses':5} {'PSNR':>6} {'gap':>6} {'seen':>6} "
-              f"{'gap':>6} {'cpu s':>6}", flush=True)  # fmt: skip
+              f"{'gap':>6} {'cpu s' if flags.device == 'cpu' else 's':>6}", flush=True)  # fmt: skip
         seen: dict[str, np.ndarray] = {}
         clean: dict[str, Result] = {}
         for row in flags.rows.split(","):
             kind, masks, poses = ROWS[row]
             if poses not in scene.views or not scene.drawn.get(masks, True):
                 continue
-            result = measure(scene, row, settings, flags.threads, seen)
+            result = measure(scene, row, settings, flags.threads, seen, flags.device)
             if kind == "clean" and masks == "none":
                 if not seen:
                     seen = seen_pixels(scene, result.renders)
