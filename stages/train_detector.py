@@ -12,14 +12,13 @@ from tqdm import tqdm
 from pipeline.attention import pools
 from pipeline.attention.samples import Pool
 from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit, score
-from pipeline.attention.weights import DETECTORS, averaged, load_network, load_others, save_network
+from pipeline.attention.weights import averaged, first_network, load_others, save_network
+from pipeline.drops.pairs import KINDS, Kind
 from pipeline.io import checkpoints
 from pipeline.io.atomic import write_csv
 from pipeline.io.paths import ScenePaths
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
-
-TRAINER = {"seed", "clean_share", "lures", "bfloat16"}
 
 
 class PhaseParams(Section):
@@ -38,10 +37,12 @@ class Params(Section):
     model: Literal["unet", "attentive"]
     weights: Annotated[str, Field(pattern=r"\.safetensors$")]
     start: str
+    target: Literal["coverage", "difference"]
     seed: Annotated[int, Field(ge=0)]
     photos: str
     painted: Annotated[int, Field(ge=pools.CHUNK, multiple_of=pools.CHUNK)]
     veils: Annotated[int, Field(ge=0, multiple_of=pools.CHUNK)]
+    films: Annotated[int, Field(ge=0, multiple_of=pools.CHUNK)]
     rendered: list[str]
     photo_pairs: list[str]
     shares: tuple[float, float, float]
@@ -52,6 +53,7 @@ class Params(Section):
     validation_rendered: list[str]
     validate_every: Annotated[int, Field(ge=1)]
     bfloat16: bool
+    on_device: bool
     phases: Annotated[list[PhaseParams], Field(min_length=1)]
     average: dict[str, Annotated[float, Field(gt=0, lt=1)]]
 
@@ -59,15 +61,12 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Writes the weights, and beside them the validation curve as CSV."""
     start = job.resolve(params.start) if params.start else None
-    if start:
-        network = load_network(start, params.model, named_by="train_detector.start")
-    else:
-        network = DETECTORS[params.model]()
-        network.initialise(params.seed)
+    network = first_network(start, params.model, params.seed, named_by="train_detector.start")
     training, validation = _training(job, params), _validation(job, params)
     phases = [Phase(**phase.model_dump()) for phase in params.phases]
     network.to(job.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    trainer = Trainer(network, training, phases, **params.model_dump(include=TRAINER))
+    told = params.model_dump(include={"seed", "clean_share", "lures", "bfloat16", "on_device"})
+    trainer = Trainer(network, training, phases, **told)
     others = load_others({job.resolve(p): s for p, s in params.average.items()}, params.model)
     key = checkpoints.training_key(params.model_dump(exclude={"weights", "average"}), start)
     checkpoint = job.paths.work("train_detector") / f"{key}.pt"
@@ -91,29 +90,30 @@ def main(job: Job, params: Params) -> str:
     return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"
 
 
-def _painted(job: Job, folder: str, seed: int, count: int, veils: bool = False) -> pools.Pictures:
+def _painted(job: Job, folder: str, seed: int, count: int, kind: Kind = "drops") -> pools.Pictures:
     """Painted pictures on the photos of a folder and on procedural ones, made where missing."""
     photos = pools.list_pictures(job.resolve(folder)) if folder else ()
     work = ScenePaths(job.root, job.scene).work("train_detector")  # the same for all variants
-    chunks = pools.painted_chunks(work, seed, count, photos, veils)
+    chunks = pools.painted_chunks(work, seed, count, photos, kind)
     map_named(pools.paint_chunk, chunks, job_label="painting")
     return pools.together([pools.read_chunk(chunk[0]) for chunk in chunks.values()], count)
 
 
 def _training(job: Job, params: Params) -> list[Pool]:
-    painted = [_painted(job, params.photos, params.seed, params.painted),
-               _painted(job, params.photos, params.seed, params.veils, veils=True)]  # fmt: skip
+    counts = zip(KINDS, (params.painted, params.veils, params.films), strict=True)
+    painted = [_painted(job, params.photos, params.seed, n, kind) for kind, n in counts]
     rendered = [pools.read_rendered(job.resolve(path)) for path in params.rendered]
     pairs = [pools.read_photo_pairs(job.resolve(path)) for path in params.photo_pairs]
-    return pools.weighted([pools.together(p) for p in (painted, rendered, pairs)], params.shares)
+    parts = [pools.aimed(pools.together(p), params.target) for p in (painted, rendered, pairs)]
+    return pools.weighted(parts, params.shares)
 
 
 def _validation(job: Job, params: Params) -> dict[str, Pool]:
     """Pictures of other seeds, photos and places than those that are trained on."""
-    painted = _painted(job, params.validation_photos, params.seed + 1, params.validation)
     folders = map(job.resolve, params.validation_rendered)
-    rendered = {path.name: Pool(*pools.read_rendered(path)) for path in folders}
-    return {**rendered, "painted": Pool(*painted)}
+    sets = {path.name: pools.read_rendered(path) for path in folders}
+    sets["painted"] = _painted(job, params.validation_photos, params.seed + 1, params.validation)
+    return {name: Pool(*pools.aimed(pictures, params.target)) for name, pictures in sets.items()}
 
 
 if __name__ == "__main__":

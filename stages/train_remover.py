@@ -43,6 +43,7 @@ class Params(Section):
     validation_photos: str
     validate_every: Count
     bfloat16: bool
+    on_device: bool
     perceptual: str
     attention: str
     train_attention: bool
@@ -56,10 +57,9 @@ class Params(Section):
 
 
 def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
-    """Writes the weights of the chosen method, and beside them the validation curve as CSV."""
+    """Writes the weights of the chosen method, and beside them the curve over unseen photos as CSV."""
     method = chosen["method"]
     trainer = _trainer(job, params, method)
-    # On other photos than those that are trained on.
     room, name = (clips, "clips") if method == "wen" else (pools, "painted")
     unseen = _painted(job, room, params.validation_photos, params.seed + 1, params.validation)
     others = {"attgan", "quan", "wen"} - {method}
@@ -76,9 +76,8 @@ def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
             checkpoints.save_checkpoint(checkpoint, trainer, rows)
             store.save_remover(work / f"{method}.safetensors", trainer.average, method)
 
-        average = fit(trainer, params.validate_every, {name: Pairs(*unseen)}, on_score)
-    target = job.resolve(params.folder) / f"{method}.safetensors"
-    store.save_remover(target, average, method)
+        mean = fit(trainer, params.validate_every, {name: Pairs(*unseen)}, on_score)
+    store.save_remover(target := job.resolve(params.folder) / f"{method}.safetensors", mean, method)
     write_csv(target.with_suffix(".csv"), CURVE, rows)
     return f"{target.name}: {rows[-1][3]} -> {rows[-1][4]} dB on pictures it was not trained on"
 
@@ -100,7 +99,8 @@ def _trainer(job: Job, params: Params, method: Method) -> Trainer:
     moving = any(phase.kind == "clips" for phase in plan.phases)
     shots = _painted(job, clips, params.photos, params.seed, params.clips) if moving else ()
     return Trainer(recipe, pairs, [Pairs(*shots)] if shots else [], plan, seed=params.seed,
-                   bfloat16=params.bfloat16, single_share=params.single_share, perceptual=backbone)  # fmt: skip
+                   bfloat16=params.bfloat16, single_share=params.single_share, perceptual=backbone,
+                   on_device=params.on_device)  # fmt: skip
 
 
 def _painted(job: Job, room: ModuleType, folder: str, seed: int, count: int) -> pools.Pictures:

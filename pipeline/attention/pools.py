@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.attention.samples import Pool, coverage_of_pair
 from pipeline.drops import stills
 from pipeline.drops.backgrounds import sample_background
-from pipeline.drops.pairs import sample_shots
+from pipeline.drops.pairs import Kind, sample_shots
 from pipeline.errors import UserError
 from pipeline.io.atomic import write_npy
 from pipeline.io.images import PHOTO_SUFFIXES, as_bytes, read_photo
@@ -25,36 +25,36 @@ Pictures = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]
 
 
 def paint_chunk(
-    path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = (), veils: bool = False
+    path: Path, seed: int, chunk: int, photos: tuple[Path, ...] = (), kind: Kind = "drops"
 ) -> None:
     """Writes a hundred painted pictures, each from a generator of its own, unless they exist.
 
     photos: clean photographs; PHOTO_SHARE of the backgrounds are crops of them, the others are
-    procedural. veils: see pairs.sample_shots. One array (100,256,256,7) uint8: rainy, clean, coverage.
+    procedural. kind: see pairs.sample_shots. One array (100,256,256,7) uint8: rainy, clean, coverage.
     """
     if path.is_file():
         return
     pictures = np.empty((CHUNK, SIZE, SIZE, 7), np.uint8)
     for k in range(CHUNK):
         rng = np.random.default_rng([seed, chunk, k])
-        shots = sample_shots(rng, background(rng, photos), veils=veils)
+        shots = sample_shots(rng, background(rng, photos), kind=kind)
         stacked = np.dstack(shots)
         pictures[k] = as_bytes(stacked)
     write_npy(path, pictures)
 
 
-def painted_name(seed: int, photos: Sequence[Path], veils: bool = False) -> str:
+def painted_name(seed: int, photos: Sequence[Path], kind: Kind = "drops") -> str:
     """A name for pictures painted from this seed and these photos, whatever folder they lie in."""
-    return stills.painted_name("veils" if veils else "painted", seed, photos)
+    return stills.painted_name("painted" if kind == "drops" else kind, seed, photos)
 
 
 def painted_chunks(
-    work: Path, seed: int, count: int, photos: tuple[Path, ...], veils: bool = False
-) -> dict[str, tuple[Path, int, int, tuple[Path, ...], bool]]:
+    work: Path, seed: int, count: int, photos: tuple[Path, ...], kind: Kind = "drops"
+) -> dict[str, tuple[Path, int, int, tuple[Path, ...], Kind]]:
     """What `paint_chunk` needs for the first `count` pictures, below `work`, by the chunk's name."""
-    folder = work / painted_name(seed, photos, veils)
+    folder = work / painted_name(seed, photos, kind)
     names = [f"{k:04d}" for k in range(-(-count // CHUNK))]
-    return {name: (folder / f"{name}.npy", seed, int(name), photos, veils) for name in names}
+    return {name: (folder / f"{name}.npy", seed, int(name), photos, kind) for name in names}
 
 
 def background(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:
@@ -118,6 +118,22 @@ def read_photo_pairs(folder: Path) -> Pictures:
         for part, picture in zip(pictures, (wet, dry, coverage_of_pair(wet, dry)), strict=True):
             part.append(picture)
     return pictures
+
+
+def aimed(pictures: Pictures, target: str) -> Pictures:
+    """The pictures with, in place of the coverage, what is to be found in them.
+
+    target: `coverage`, the water itself; `difference`: 255 where it changes a colour by more than 30 of
+    255, as the masks of published photo pairs are made, see samples.coverage_of_pair.
+    """
+    if target == "coverage":
+        return pictures
+    rainy, clean, coverage = pictures
+    seen = [
+        np.where(cover > 0, coverage_of_pair(wet, dry), 0).astype(np.uint8)
+        for wet, dry, cover in zip(rainy, clean, coverage, strict=True)
+    ]
+    return rainy, clean, seen
 
 
 def together(parts: Sequence[Pictures], count: int | None = None) -> Pictures:

@@ -19,6 +19,8 @@ PAIR_DIFFERENCE = 30 / 255
 # Water that changes the picture by less than this cannot be seen, and counts for little.
 SEEN_DIFFERENCE = 6 / 255
 UNSEEN_WEIGHT = 0.1
+# What crops at another scale take from the picture, in parts of their own size.
+ZOOM = (0.6, 2.0)
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def _window(rng: np.random.Generator, crop: int) -> int:
     """How many pixels a crop takes from the picture: half of them at another scale."""
     if rng.random() < 0.5:
         return crop
-    return round(crop * float(np.exp(rng.uniform(np.log(0.6), np.log(2.0)))))
+    return round(crop * float(np.exp(rng.uniform(*np.log(ZOOM)))))
 
 
 def _offset(rng: np.random.Generator, length: int, size: int) -> int:

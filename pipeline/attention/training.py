@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from pipeline.attention.muon import Muon
 from pipeline.attention.network import AttentiveRecurrentNet
+from pipeline.attention.resident import draw_resident, resident
 from pipeline.attention.samples import VISIBLE_COVERAGE, Pool, draw_batch, wetness
 from pipeline.attention.unet import DropUNet
 from pipeline.attention.weights import Detector
@@ -83,14 +84,17 @@ class Trainer:
 
     Every crop is drawn from a generator seeded with (seed, phase, iteration), so a fit that was
     interrupted and goes on from `state()` ends like one that was not. bfloat16: products in half
-    precision, about twice as fast where the processor knows it.
+    precision, about twice as fast where the processor knows it. on_device: all pictures are kept where the
+    network computes and crops are cut there, so that a GPU need not wait for them.
     """
 
     def __init__(
         self, network: Detector, pools: Sequence[Pool], phases: Sequence[Phase],
         *, seed: int, clean_share: float, lures: float = 0.0, bfloat16: bool = False,
+        on_device: bool = False,
     ) -> None:  # fmt: skip
         self.network, self.pools, self.phases = network, pools, phases
+        self.stacks = resident(pools, str(_device(network))) if on_device else []
         self.seed, self.bfloat16 = seed, bfloat16
         self.clean_share, self.lures = clean_share, lures
         self.phase = self.iteration = self.seen = self.done = 0
@@ -130,7 +134,8 @@ class Trainer:
         """One iteration; its loss."""
         phase = self.phases[self.phase]
         rng = np.random.default_rng([self.seed, self.phase, self.iteration])
-        drawn = draw_batch(self.pools, rng, phase.batch, phase.crop, self.clean_share, self.lures)
+        wish = (rng, phase.batch, phase.crop, self.clean_share, self.lures)
+        drawn = draw_resident(self.stacks, *wish) if self.stacks else draw_batch(self.pools, *wish)
         self.network.train()
         loss = self._loss(*drawn, phase.steps)
         for optimiser in self.optimisers:
@@ -145,7 +150,7 @@ class Trainer:
         return float(loss.detach())
 
     def _loss(self, images: Tensor, coverage: Tensor, weight: Tensor, steps: int) -> Tensor:
-        device = next(self.network.parameters()).device
+        device = _device(self.network)
         images = images.to(device, memory_format=torch.channels_last)
         target, weight = wetness(coverage.to(device)), weight.to(device)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16):
@@ -159,9 +164,7 @@ class Trainer:
         return attention_loss(found, target, weight)
 
     def _apply(self, phase: Phase) -> None:
-        warm = min(1.0, (self.iteration + 1) / 20)
-        progress = self.iteration / phase.iterations
-        rate = phase.rate * warm * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress)))
+        rate = rate_at(phase, self.iteration)
         for optimiser, factor in zip(self.optimisers, (1.0, 0.15), strict=True):
             for group in optimiser.param_groups:
                 group["lr"] = rate * factor
@@ -192,6 +195,17 @@ class Trainer:
         self.phase, self.iteration, self.seen, self.done = state["where"]
 
 
+def rate_at(phase: Phase, iteration: int) -> float:
+    """Muon's learning rate: it rises over twenty iterations and falls along a half cosine."""
+    warm = min(1.0, (iteration + 1) / 20)
+    fall = 0.5 * (1 + math.cos(math.pi * iteration / phase.iterations))
+    return phase.rate * warm * (0.05 + 0.95 * fall)
+
+
+def _device(network: Detector) -> torch.device:
+    return next(network.parameters()).device
+
+
 def _is_matrix(name: str, parameter: Tensor) -> bool:
     """Muon takes the hidden convolutions; Adam the map's single row and all vectors."""
     return parameter.ndim == 4 and not name.startswith(("det_conv_mask", "last"))
@@ -205,7 +219,7 @@ def score(network: Detector, pool: Pool, steps: int) -> Score:
 
     All pixels of all pictures are counted together; thresholds are tried in steps of 0.05.
     """
-    device = next(network.parameters()).device
+    device = _device(network)
     counts = np.zeros((3, len(THRESHOLDS)))  # hits, marked, wet
     for rainy, cover in zip(pool.rainy, pool.coverage, strict=True):
         bgr = np.ascontiguousarray(rainy[..., ::-1].transpose(2, 0, 1), np.float32) / 255

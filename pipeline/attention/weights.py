@@ -52,6 +52,15 @@ def load_network(
     return network
 
 
+def first_network(path: Path | None, model: str, seed: int, named_by: str) -> Detector:
+    """The network `model` to begin a training with: of a file, or with starting weights drawn."""
+    if path is not None:
+        return load_network(path, model, named_by)
+    network = DETECTORS[model]()
+    network.initialise(seed)
+    return network
+
+
 def load_others(
     shares: Mapping[Path, float], model: str, named_by: str = "train_detector.average"
 ) -> list[tuple[Detector, float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,6 +13,8 @@ from pipeline.drops.optics import Image, linear_to_srgb, srgb_to_linear
 from pipeline.drops.painter import paint, scatter
 
 CLEAN_SHARE = 0.08
+Kind = Literal["drops", "veils", "films"]
+KINDS: tuple[Kind, ...] = ("drops", "veils", "films")
 
 
 def sample_pair(
@@ -32,19 +35,19 @@ def sample_shots(
     background: Image,
     *,
     clean_share: float = CLEAN_SHARE,
-    veils: bool = False,
+    kind: Kind = "drops",
 ) -> tuple[Image, Image, NDArray[np.float32]]:
     """The pair of `sample_pair` with, in its middle, the same photo without the drops.
 
     Both photos are taken through the same pane by the same camera with the same noise, so that
-    they differ where the water shows and nowhere else (but for what compression does). veils: the
-    water is wide and flat, or blurred to faint discs.
+    they differ where the water shows and nowhere else (but for what compression does). kind: veils are wide
+    flat water or drops blurred to faint discs; films have no outline, as a haze of water or a reflection.
     """
     height, width = background.shape[:2]
     dry = through_glass(rng, background)
     wet, coverage = dry, np.zeros((height, width), np.float32)
     if rng.random() >= clean_share:
-        wet, coverage = (_veiled if veils else _wet)(rng, dry)
+        wet, coverage = {"drops": _wet, "veils": _veiled, "films": _filmed}[kind](rng, dry)
     clean = through_camera(copy.deepcopy(rng), dry)
     return through_camera(rng, wet), clean, coverage
 
@@ -125,6 +128,32 @@ def _veiled(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.f
         rim_light=float(rng.uniform(0.15, 0.7)),
         surroundings=_surroundings(rng),
     )
+
+
+def _filmed(rng: np.random.Generator, image: Image) -> tuple[Image, NDArray[np.float32]]:
+    """Films: the photo shifted and blurred under light from elsewhere, beginning nowhere; often among drops."""
+    wet, coverage = _wet(rng, image) if rng.random() < 0.7 else (image, np.float32(0))
+    size = (image.shape[1], image.shape[0])
+    field, *shift = (_waves(rng, size, int(rng.integers(2, 8))) for _ in range(3))
+    ramp = (field - np.quantile(field, rng.uniform(0.5, 0.92))) / rng.uniform(0.2, 1.0)
+    alpha = (np.clip(ramp, 0, 1) * rng.uniform(0.5, 1.0)).astype(np.float32)
+    light = srgb_to_linear(wet)
+    reach = np.float32(rng.uniform(1, 12))
+    y, x = np.mgrid[: size[1], : size[0]].astype(np.float32)
+    seen = cv2.remap(light, x + reach * shift[0], y + reach * shift[1], cv2.INTER_LINEAR,
+                     borderMode=cv2.BORDER_REFLECT)  # fmt: skip
+    seen = cv2.GaussianBlur(seen, (0, 0), float(np.exp(rng.uniform(0, np.log(10)))))
+    glow = cv2.resize(_surroundings(rng), size, interpolation=cv2.INTER_CUBIC)
+    glow = glow * (np.percentile(light, 95, axis=(0, 1)) * np.exp(rng.uniform(-0.7, 0.7)))
+    film = seen + np.float32(rng.uniform(0.03, 0.5)) * (glow.astype(np.float32) - seen)
+    out = linear_to_srgb(light + alpha[..., None] * (film - light))
+    return np.where(alpha[..., None] > 0, out, wet), 1 - (1 - coverage) * (1 - alpha)
+
+
+def _waves(rng: np.random.Generator, size: tuple[int, int], cells: int) -> NDArray[np.float32]:
+    """A smooth random field (H, W) about 0 with `cells` ups and downs along a side; size: (W, H)."""
+    grid = rng.normal(0, 1, (cells, cells)).astype(np.float32)
+    return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_CUBIC))
 
 
 def _surroundings(rng: np.random.Generator) -> Image:

@@ -11,8 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.geometry.crops import Stack, draw_crops, stacked
+
 # |rainy - clean| beyond this is a drop, in Qian et al. (CVPR 2018) as for all who use their pairs.
 DIFFERENCE = 30 / 255
+ZOOM = (0.7, 1.6)
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,29 @@ def draw_batch(pools: Sequence[Pairs], rng: np.random.Generator, batch: int, cro
     return Batch(rainy, clean, drop_map(rainy, clean))
 
 
+def resident(pools: Sequence[Pairs], device: str) -> list[Stack]:
+    """The pools on the device; channels: the rainy frames, the clean ones, coverage."""
+    return [
+        stack
+        for pool in pools
+        for stack in stacked([pool.rainy, pool.clean, pool.coverage], pool.share, device)
+    ]
+
+
+def draw_resident(
+    stacks: Sequence[Stack], rng: np.random.Generator, batch: int, crop: int
+) -> Batch:
+    """As `draw_batch`, cut and altered on the device where the pictures lie."""
+    crops = draw_crops(stacks, rng, batch, crop, zoom=ZOOM, second=1.0)
+    changed = rng.random((batch, 1)) < 0.5
+    gamma = np.exp(rng.uniform(-0.25, 0.25, (batch, 1)) * changed)
+    gain = np.exp((rng.normal(0, 0.1, (batch, 1)) + rng.normal(0, 0.04, (batch, 3))) * changed)
+    told = torch.from_numpy(np.hstack([gamma, gain])).to(crops)[:, None, :, None, None]
+    pair = crops[:, :-1].unflatten(1, (-1, 3)).clamp(0, 1) ** told[:, :, :1] * told[:, :, 1:]
+    rainy, clean = pair.clamp(0, 1).chunk(2, 1)
+    return Batch(rainy, clean, drop_map(rainy, clean))
+
+
 def _draw(
     rainy: np.ndarray, clean: np.ndarray, cover: np.ndarray, rng: np.random.Generator, crop: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -95,4 +121,4 @@ def _window(rng: np.random.Generator, crop: int) -> int:
     """How many pixels a crop takes from the picture: half of them at another scale."""
     if rng.random() < 0.5:
         return crop
-    return round(crop * float(np.exp(rng.uniform(np.log(0.7), np.log(1.6)))))
+    return round(crop * float(np.exp(rng.uniform(*np.log(ZOOM)))))

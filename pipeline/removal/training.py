@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from pipeline.errors import UserError
 from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop, critic_of
-from pipeline.removal.samples import Batch, Pairs, draw_batch
+from pipeline.removal.samples import Batch, Pairs, draw_batch, draw_resident, resident
 
 # Columns of the validation curve; see `curve_rows`.
 CURVE = ("iteration", "loss", "set", "psnr_rainy", "psnr")
@@ -72,15 +72,18 @@ class Trainer:
     iteration), so a fit that was interrupted and goes on from `state()` ends like one that was not.
     single_share: of the iterations with clips, how many look at five times as many single pictures
     instead. bfloat16: products in half precision, about twice as fast where the processor knows it.
+    on_device: all pictures are kept where the recipe computes, and crops are cut there.
     """
 
     def __init__(
         self, recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs], plan: Plan,
         *, seed: int, bfloat16: bool = False, single_share: float = 0.0,
-        perceptual: nn.Module | None = None,
+        perceptual: nn.Module | None = None, on_device: bool = False,
     ) -> None:  # fmt: skip
         _check(recipe, pairs, clips, plan)
         self.recipe, self.pairs, self.clips = recipe, pairs, clips
+        where = str(_device(recipe)) if on_device else None
+        self.stacks = [resident(pools, where) for pools in (pairs, clips)] if where else []
         self.plan, self.phases, self.seed = plan, plan.phases, seed
         self.bfloat16, self.single_share, self.perceptual = bfloat16, single_share, perceptual
         self.critic = critic_of(recipe, seed) if plan.adversarial > 0 else None
@@ -134,13 +137,12 @@ class Trainer:
         return float(loss.detach())
 
     def _draw(self, phase: Phase, rng: np.random.Generator) -> Batch:
-        pools, count = self.pairs, phase.batch
-        if phase.kind == "clips":
-            if rng.random() < self.single_share:
-                count *= 5
-            else:
-                pools = self.clips
-        device = _device(self.recipe)
+        moving, count = phase.kind == "clips", phase.batch
+        if moving and rng.random() < self.single_share:
+            moving, count = False, 5 * count
+        if self.stacks:
+            return draw_resident(self.stacks[moving], rng, count, phase.crop)
+        pools, device = self.clips if moving else self.pairs, _device(self.recipe)
         return Batch(*(part.to(device) for part in draw_batch(pools, rng, count, phase.crop)))
 
     def _precision(self) -> torch.autocast:
@@ -148,14 +150,9 @@ class Trainer:
         return torch.autocast(device, torch.bfloat16, enabled=self.bfloat16)
 
     def _apply(self, loss: Tensor, phase: Phase) -> None:
-        warm = min(1.0, (self.iteration + 1) / WARM)
-        progress = self.iteration / phase.iterations
-        fall = 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))
-        if phase.power is not None:
-            fall = (1 - progress) ** phase.power
         optimiser = self.optimisers[0]
         for group in optimiser.param_groups:
-            group["lr"] = phase.rate * warm * fall
+            group["lr"] = rate_at(phase, self.iteration)
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.recipe.parameters(), 1.0)
@@ -212,6 +209,14 @@ class Trainer:
             found.append([psnr(each, clean[:, middle]) for each in (rainy[:, middle], restored)])
         before, after = np.mean(found, axis=0)
         return float(before), float(after)
+
+
+def rate_at(phase: Phase, iteration: int) -> float:
+    """Adam's learning rate at an iteration of a phase."""
+    warm, progress = min(1.0, (iteration + 1) / WARM), iteration / phase.iterations
+    if phase.power is not None:
+        return phase.rate * warm * (1 - progress) ** phase.power
+    return phase.rate * warm * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
 def psnr(found: Tensor, wanted: Tensor) -> float:

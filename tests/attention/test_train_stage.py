@@ -23,10 +23,12 @@ PARAMS = Params(
     model="unet",
     weights="w/unet.safetensors",
     start="",
+    target="coverage",
     seed=5,
     photos="photos",
     painted=100,
     veils=100,
+    films=0,
     rendered=["rendered"],
     photo_pairs=["pairs"],
     shares=(0.5, 0.5, 0.5),
@@ -37,6 +39,7 @@ PARAMS = Params(
     validation_rendered=["rendered"],
     validate_every=2,
     bfloat16=False,
+    on_device=False,
     phases=PHASES,
     average={},
 )
@@ -131,7 +134,7 @@ def test_trained_weights_are_averaged_with_others_and_scored_anew(root: Path) ->
 
 def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:
     photos = pools.list_pictures(root / "photos")
-    assert pools.painted_name(5, photos) != pools.painted_name(5, photos, veils=True)
+    assert pools.painted_name(5, photos) != pools.painted_name(5, photos, kind="veils")
     chunk = root / "0.npy"
     pools.paint_chunk(chunk, 5, 0, photos)
     written = chunk.read_bytes()
@@ -144,5 +147,5 @@ def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:
     ]
     assert np.mean(np.concatenate(dry)) < 3  # compression alone tells them apart there
     veiled = root / "1.npy"
-    pools.paint_chunk(veiled, 5, 0, photos, veils=True)
+    pools.paint_chunk(veiled, 5, 0, photos, kind="veils")
     assert not np.array_equal(np.load(veiled)[..., 6], np.load(chunk)[..., 6])

@@ -144,11 +144,26 @@ def test_pairs_are_repeatable_and_sometimes_dry() -> None:
 def test_veils_are_fainter_than_drops() -> None:
     background = sample_background(np.random.default_rng(4), 96)
     changes = []
-    for veils in (False, True):
+    for kind in ("drops", "veils"):
         rngs = [np.random.default_rng([0, k]) for k in range(12)]
-        shots = [sample_shots(rng, background, clean_share=0, veils=veils) for rng in rngs]
+        shots = [sample_shots(rng, background, clean_share=0, kind=kind) for rng in rngs]
         changes.append(np.concatenate([np.abs(wet - dry)[c > 0.05] for wet, dry, c in shots]))
     assert 0.01 < changes[1].mean() < 0.7 * changes[0].mean()
+
+
+def test_films_have_no_outline_and_their_coverage_is_what_changed() -> None:
+    background = sample_background(np.random.default_rng(4), 96)
+    steepest, inside, outside = [], [], []
+    for k in range(12):
+        rng = np.random.default_rng([0, k])
+        wet, dry, cover = sample_shots(rng, background, clean_share=0, kind="films")
+        assert cover.dtype == wet.dtype == np.float32
+        assert 0 <= cover.min() <= cover.max() <= 1 and 0 <= wet.min() <= wet.max() <= 1
+        steepest.append(np.quantile(np.abs(np.diff(cover, axis=1)), 0.9))
+        inside.append(np.abs(wet - dry)[cover > 0.3])
+        outside.append(np.abs(wet - dry)[cover == 0])
+    assert np.median(steepest) < 0.25  # a drop in focus goes from 0 to 1 within a pixel
+    assert np.concatenate(inside).mean() > 3 * np.concatenate(outside).mean()
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS), key=lambda f: f.__name__))

@@ -34,6 +34,7 @@ PARAMS = Params(
     validation_photos="",
     validate_every=2,
     bfloat16=False,
+    on_device=False,
     perceptual="",
     attention="attention.safetensors",
     train_attention=False,

@@ -19,7 +19,7 @@ from pipeline.removal.autoencoder import Scales, multi_scale_loss
 from pipeline.removal.critics import AttentiveCritic, PatchCritic, Verdict
 from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, wen_loss
 from pipeline.removal.recipes import Added, AnyRecipe, recipe_of, weights_of
-from pipeline.removal.samples import Pairs, draw_batch, drop_map
+from pipeline.removal.samples import Pairs, draw_batch, draw_resident, drop_map, resident
 from pipeline.removal.training import Phase, Plan, Trainer, fit
 from pipeline.removal.wen import Frames, mend
 
@@ -197,6 +197,17 @@ def test_features_of_a_vgg_tell_pictures_apart(
         PerceptualLoss(path, method)
 
 
+def test_crops_cut_on_the_device_hold_the_same_things() -> None:
+    for frames in (1, 5):
+        stacks = resident([pictures(frames)], "cpu")
+        found, again = (draw_resident(stacks, np.random.default_rng(0), 3, 32) for _ in range(2))
+        beside = draw_batch([pictures(frames)], np.random.default_rng(0), 3, 32)
+        for one, two, other in zip(found, again, beside, strict=True):
+            assert torch.equal(one, two) and one.shape == other.shape and one.dtype == other.dtype
+        assert torch.equal(found.drops, drop_map(found.rainy, found.clean))
+        assert float(found.rainy.min()) >= 0 and 0 < float(found.drops.mean()) < 1
+
+
 def test_batches_hold_both_partners_alike_and_clips_their_frames() -> None:
     found = draw_batch([pictures()], np.random.default_rng(0), 3, 32)
     assert found.rainy.shape == found.clean.shape == (3, 1, 3, 32, 32)
@@ -267,7 +278,8 @@ def test_interrupted_and_resumed_is_the_same(
 ) -> None:
     def trainer() -> Trainer:
         pool = [pictures(frames)]
-        return Trainer(recipe(method), pool, pool, plan(kind, adversarial=adversarial), seed=1)
+        return Trainer(recipe(method), pool, pool, plan(kind, adversarial=adversarial), seed=1,
+                       on_device=method == "wen")  # fmt: skip
 
     whole, first, second = trainer(), trainer(), trainer()
     before = {name: value.clone() for name, value in whole.recipe.state_dict().items()}
