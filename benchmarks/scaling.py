@@ -121,7 +121,7 @@ def stages(settings: dict[str, Any]) -> None:
     lookups = count * 8 * levels
     work = [
         ("batch of rays", lambda: buffer.batch(1, rays_per_step), 0, rays_per_step * 60),
-        ("proposal, forward", lambda: model._propose(rays, generator, []), 0,
+        ("proposal, forward", lambda: model._propose(rays, model._noise(rays, generator), []), 0,
          rays_per_step * bins * (LINE + 40)),
         ("samples along rays", sample, 0, count * 6 * 4),
         ("corners and weights", place, 0, lookups * 8),

@@ -64,7 +64,8 @@ def main(job: Job, params: Params) -> str:
     keep_masks = job.paths.refine if params.use_masks else None
     photos = photos_to_fit(read_posed_images(job.paths.images, keep_masks, views), near, far)
     settings = params.model_dump(include=SETTINGS)
-    field = build_around(params.model, list(views.values()), near, far, **settings).to(job.device)
+    cameras = list(views.values())
+    field = build_around(params.model, cameras, near, far, device=job.device, **settings)
     buffer = RayBuffer(photos, params.seed, job.device)
     key = fit_key(field, photos, params.model_dump(), job.device)
     checkpoint = Checkpoint(job.paths.work("nerf") / "checkpoint.safetensors", key)
@@ -107,7 +108,6 @@ def _fit(
             rate=params.rate,
             exposure=params.exposure,
             average=0.0 if paper else params.average,
-            shards=2 if job.device == "cpu" else 1,
             threads=cores(),
             save_every=params.save_every, save=checkpoint.save, resume=resume, progress=show,
         )  # fmt: skip

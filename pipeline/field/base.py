@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -76,6 +77,12 @@ class Field(Protocol):
 
         ``gain`` ``(R, 3)`` multiplies the rendered colours: the exposure of each ray's photo.
         """
+
+    def phase(self, step: int) -> Hashable:
+        """Steps of the same phase do the same operations, with other numbers."""
+
+    def samples_per_ray(self) -> int:
+        """How many samples a ray takes: what its memory grows with."""
 
     def parts(self) -> list[Part]:
         """How each parameter is to be stepped; every parameter is in one part."""

@@ -98,41 +98,52 @@ class RayBuffer:
             )
         self.seed, self.device = seed, device
         self.count, self.photos = int(order.size), len(photos)
-        self._kept = torch.from_numpy(order)
+        self._kept = torch.from_numpy(order).to(device)
         self._colours = torch.from_numpy(np.concatenate(colours)).to(device)
-        self._offsets = torch.tensor(offsets[1:])
-        self._starts = torch.tensor(offsets[:-1])
-        self._widths = torch.tensor([p.image.shape[1] for p in photos])
-        self._poses = _stack([p.cam_from_world[:3, :4] for p in photos])
-        self._intrinsics = _stack([np.array(p.intrinsics) for p in photos])
-        self._bounds = _stack([np.array([p.near, p.far]) for p in photos])
+        self._offsets = torch.tensor(offsets[1:], device=device)
+        self._starts = torch.tensor(offsets[:-1], device=device)
+        self._widths = torch.tensor([p.image.shape[1] for p in photos], device=device)
+        self._poses = _stack([p.cam_from_world[:3, :4] for p in photos]).to(device)
+        self._intrinsics = _stack([np.array(p.intrinsics) for p in photos]).to(device)
+        self._distorted = any(p.intrinsics[4] != 0 for p in photos)
+        self._bounds = _stack([np.array([p.near, p.far]) for p in photos]).to(device)
         self._soft = _soft_masks(photos, device)
         self._epoch = -1
         self._shuffled = self._kept
 
     def batch(self, step: int, size: int) -> Batch:
         """The ``size`` rays of a step; fewer if fewer are kept."""
+        return self.rays(self.pixels(step, size))
+
+    def pixels(self, step: int, size: int) -> Tensor:
+        """The numbers ``(size,)`` int32 of a step's pixels; fewer if fewer are kept."""
         size = min(size, self.count)
         epoch, place = divmod(step, self.count // size)
         if epoch != self._epoch:
-            generator = torch.Generator().manual_seed(self.seed * 100_003 + epoch)
-            order = torch.randperm(self.count, generator=generator, dtype=torch.int32)
+            generator = torch.Generator(self.device).manual_seed(self.seed * 100_003 + epoch)
+            order = torch.randperm(
+                self.count, generator=generator, dtype=torch.int32, device=self.device
+            )
             self._shuffled, self._epoch = self._kept[order.long()], epoch
-        pixel = self._shuffled[place * size : (place + 1) * size].long()
+        return self._shuffled[place * size : (place + 1) * size]
+
+    def rays(self, pixels: Tensor) -> Batch:
+        """The rays through :meth:`pixels`; made on the buffer's device, which is not waited for."""
+        pixel = pixels.long()
         view = torch.searchsorted(self._offsets, pixel, right=True)
         inside = pixel - self._starts[view]
         width = self._widths[view]
         rows = torch.div(inside, width, rounding_mode="floor")
         columns = inside - rows * width
-        rays_o, rays_d = pixel_rays(columns, rows, self._intrinsics[view], self._poses[view])
+        rays_o, rays_d = pixel_rays(
+            columns, rows, self._intrinsics[view], self._poses[view], self._distorted
+        )
         near, far = self._bounds[view].unbind(-1)
-        rays = Rays(*(v.to(self.device) for v in (rays_o, rays_d, near, far)))
-        pixel, view = pixel.to(self.device), view.to(self.device)
         observed = self._colours[pixel].float() / 255.0
-        drop_mask = torch.zeros(size, device=self.device)
+        drop_mask = torch.zeros_like(near)
         if self._soft is not None:
             drop_mask = self._soft[pixel].float() / 255.0
-        return Batch(rays, observed, drop_mask, view)
+        return Batch(Rays(rays_o, rays_d, near, far), observed, drop_mask, view)
 
 
 def _soft_masks(photos: Sequence[PosedPhoto], device: str) -> Tensor | None:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from pipeline.field import fused, kernels
 from pipeline.field.sampling import middles
+from pipeline.geometry.constants import constant
 
 HASH_PRIMES = (1, 2654435761 - 2**32, 805459861)
 
@@ -43,11 +44,11 @@ def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tupl
     """
     dense = math.prod(resolution) <= size
     steps = (1, resolution[0], resolution[0] * resolution[1]) if dense else HASH_PRIMES
-    last = torch.tensor([[r - 1.0] for r in resolution], dtype=x.dtype, device=x.device)
+    last = constant(tuple((r - 1.0,) for r in resolution), x)
     position = x * last
     cell = torch.minimum(position.floor_(), last - 1.0)
     upper = torch.addcmul(-cell, x, last)
-    stride = torch.tensor([[step] for step in steps], dtype=torch.int32, device=x.device)
+    stride = constant(tuple((step,) for step in steps), x, torch.int32)
     ids = torch.stack([cell, cell + 1.0]).to(torch.int32) * stride
     shares = torch.stack([1.0 - upper, upper])
     a, b, c = ids[:, None, None, 0], ids[None, :, None, 1], ids[None, None, :, 2]
@@ -112,6 +113,8 @@ def gather(
     With a ``sink`` the table's gradient is not formed: the rows to add go into the list, under
     ``name``, so that a fit can add up several batches at once, one table per thread.
     """
+    if torch.compiler.is_compiling():  # the compiler makes one loop of all this, both ways
+        return (table[rows] * weights[..., None]).sum(1)
     return _Gather.apply(table, rows, weights, name, sink)
 
 
@@ -140,6 +143,8 @@ def pick(
     table: Tensor, rows: Tensor, name: str = "", sink: list[RowGradient] | None = None
 ) -> Tensor:
     """``table[rows]`` of a table ``(size, 1)``, in the shape of ``rows``; ``sink`` as for gather."""
+    if torch.compiler.is_compiling():
+        return table.view(-1)[rows]
     return _Pick.apply(table, rows, name, sink)
 
 
@@ -164,7 +169,7 @@ def nearest_rows(
     x = middle
     if along is not None:
         x = edges[:, :, :-1] + along * (edges[:, :, 1:] - edges[:, :, :-1])
-    counts = torch.tensor(sizes, dtype=x.dtype, device=x.device)[:, None, None]
+    counts = constant(sizes, x)[:, None, None]
     place = x * counts
     if shake is not None:
         place = place + shake - 0.5

@@ -7,9 +7,8 @@ threads there are, only the time does.
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,11 +18,19 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.errors import UserError
-from pipeline.field.base import Field, Part, Rays
+from pipeline.field.base import Rays
 from pipeline.field.buffer import Batch, RayBuffer
-from pipeline.field.encoding import RowGradient, add_rows, add_single
-
-log = logging.getLogger(__name__)
+from pipeline.field.cuda_steps import CudaSteps
+from pipeline.field.steppers import (
+    Average,
+    Exposure,
+    Found,
+    Stepper,
+    found_in,
+    named_in,
+    steppers_of,
+    totals,
+)
 
 T = TypeVar("T")
 
@@ -37,114 +44,6 @@ class Record:
 
     rows: list[tuple[int, float, float]] = field(default_factory=list)
     gains: Tensor | None = None
-
-
-class Exposure(nn.Module):
-    """One factor per photo and channel between the scene and the photo; their mean is 1.
-
-    The mean is taken of the logarithms: what all photos share is the scene's own brightness.
-    """
-
-    def __init__(self, photos: int) -> None:
-        super().__init__()
-        self.log_gain = nn.Parameter(torch.zeros(photos, 3))
-
-    def gains(self) -> Tensor:
-        """``(V, 3)`` factors."""
-        return torch.exp(self.log_gain - self.log_gain.mean(0))
-
-    def parts(self) -> list[Part]:
-        """How it is stepped."""
-        return [Part("log_gain", ("log_gain",), 1e-2, 0.1, warmup=50)]
-
-
-class Stepper:
-    """Adam for one part of a field, at a rate that depends on the step alone."""
-
-    def __init__(
-        self, part: Part, parameters: list[nn.Parameter], steps: int, rate: float = 1.0
-    ) -> None:
-        self.part, self.parameters, self.steps = part, parameters, steps
-        self.rate = part.rate * rate
-        self.adam = torch.optim.AdamW(
-            parameters,
-            lr=self.rate,
-            betas=part.betas,
-            eps=part.eps,
-            weight_decay=part.decay,
-            fused=True,
-        )
-
-    def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
-        """One step with the given gradients; none at all leaves the part as it is."""
-        if all(gradient is None for gradient in gradients):
-            return
-        rate = self.rate * self.part.final ** (step / self.steps)
-        if self.part.warmup:
-            rate *= min(1.0, (step + 1) / self.part.warmup)
-        self.adam.param_groups[0]["lr"] = rate
-        for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            parameter.grad = gradient
-        self.adam.step()
-        for parameter in self.parameters:
-            parameter.grad = None
-
-    def state(self) -> dict[str, Tensor]:
-        """Adam's running moments by name; what :meth:`restore` takes back."""
-        out = {}
-        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
-            for key, value in self.adam.state[parameter].items():
-                out[f"{key}:{name}"] = value
-        return out
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Continue from :meth:`state`."""
-        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
-            for key in ("step", "exp_avg", "exp_avg_sq"):
-                if f"{key}:{name}" in state:
-                    self.adam.state[parameter][key] = state[f"{key}:{name}"].clone()
-
-
-class Average:
-    """The mean of parameters over the last ``steps - start`` of ``steps`` steps, every tenth and the last.
-
-    Rates of Adam's kind leave parameters wandering about where they have arrived; their mean is
-    nearer to it than any of them (Polyak and Juditsky, doi:10.1137/0330046).
-    """
-
-    EVERY = 10
-
-    def __init__(self, learned: list[nn.Module], steps: int, share: float) -> None:
-        self.named, self.steps, self.span = _named(learned), steps, round(share * steps)
-        self.means: dict[str, Tensor] = {}
-
-    def add(self, done: int) -> None:
-        """The parameters as they are after ``done`` steps, if these count."""
-        left = self.steps - done
-        if left >= self.span or left % self.EVERY:
-            return
-        number = (self.span - 1) // self.EVERY - left // self.EVERY + 1
-        for name, parameter in self.named:
-            if number == 1:
-                self.means[name] = parameter.detach().clone()
-            else:
-                self.means[name].lerp_(parameter.detach(), 1.0 / number)
-
-    def finish(self) -> None:
-        """Gives every parameter its mean, if there is one."""
-        with torch.no_grad():
-            for name, parameter in self.named:
-                if name in self.means:
-                    parameter.copy_(self.means[name])
-
-    def state(self) -> dict[str, Tensor]:
-        """The means by name; what :meth:`restore` takes back."""
-        return {f"mean:{name}": value for name, value in self.means.items()}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Continue from :meth:`state`."""
-        names = [name for name, _ in self.named if f"mean:{name}" in state]
-        self.means = {name: state[f"mean:{name}"].clone() for name in names}
 
 
 def fit(
@@ -164,6 +63,7 @@ def fit(
     save: Save | None = None,
     resume: tuple[int, dict[str, Tensor]] | None = None,
     progress: Progress | None = None,
+    record: bool = True,
 ) -> Record:
     """Fit ``model`` (a :class:`Field`) in place; the course of it comes out.
 
@@ -173,38 +73,47 @@ def fit(
     ``average`` is the share of the steps, the last ones, over which the parameters' mean is taken
     for the field that comes out (0: as the last step left it).
     ``save(step, state)`` is called every ``save_every`` steps;
-    ``resume`` takes such a pair and goes on to the same bytes. ``progress(step, loss, psnr)``.
+    ``resume`` takes such a pair and goes on, on a CPU to the same bytes. ``progress(step, loss, psnr)``.
+    On a GPU shards and threads mean nothing, and steps are recorded unless ``record`` is False
+    (:class:`pipeline.field.cuda_steps.CudaSteps`).
     Raises UserError when the loss is not finite.
     """
     light = Exposure(buffer.photos).to(buffer.device) if exposure else None
     learned = [model] if light is None else [model, light]
-    steppers = [stepper for module in learned for stepper in _steppers(module, steps, rate)]
+    steppers = [stepper for module in learned for stepper in steppers_of(module, steps, rate)]
     # The largest first: two threads then finish at about the same time.
     steppers.sort(key=lambda stepper: -sum(one.numel() for one in stepper.parameters))
-    record, mean = Record(), Average(learned, steps, average)
+    course, mean = Record(), Average(learned, steps, average)
     running: list[Tensor] = []
     first = 0
     if resume is not None:
-        first = _restore(learned, steppers, mean, record, resume)
+        first = _restore(learned, steppers, mean, course, resume)
         running = list(resume[1]["running"])
-    with _pool(threads, buffer.device) as pool:
-        for step in range(first, steps):
+    on_gpu = buffer.device != "cpu"
+    with _pool(1 if on_gpu else threads) as pool:
+
+        def on_cpu(step: int) -> Tensor:
             batch = buffer.batch(step, batch_rays)
-            losses = _one_step(model, light, steppers, batch, step, seed, shards, pool)
-            running.append(losses)
+            return _one_step(model, light, steppers, batch, step, seed, shards, pool)
+
+        take: Callable[[int], Tensor] = on_cpu
+        if on_gpu:
+            take = CudaSteps(model, light, steppers, buffer, batch_rays, seed, record)
+        for step in range(first, steps):
+            running.append(take(step))
             done = step + 1
             mean.add(done)
             if done % log_every == 0 or done == steps:
-                record.rows.append(_row(done, running))
+                course.rows.append(_row(done, running))
                 running.clear()
                 if progress is not None:
-                    progress(*record.rows[-1])
+                    progress(*course.rows[-1])
             if save is not None and save_every and done % save_every == 0 and done < steps:
-                save(done, _state(learned, steppers, mean, record, running))
+                save(done, _state(learned, steppers, mean, course, running))
     mean.finish()
     if light is not None:
-        record.gains = light.gains().detach().cpu()
-    return record
+        course.gains = light.gains().detach().cpu()
+    return course
 
 
 def _row(done: int, losses: list[Tensor]) -> tuple[int, float, float]:
@@ -225,62 +134,22 @@ def _one_step(
     pool: Executor | None,
 ) -> Tensor:
     """Gradients of every shard, then a step of every part; (loss, photometric loss) comes out."""
-    dense = [
-        (name, parameter)
-        for stepper in steppers
-        for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
-    ]
     pieces = _cut(batch, shards)
-    total = batch.observed.shape[0]
+    rays = batch.observed.shape[0]
 
-    def shard(number: int) -> tuple[Tensor, dict[str, Tensor | None], list[RowGradient]]:
+    def shard(number: int) -> Found:
         piece = pieces[number]
-        share = piece.observed.shape[0] / total
-        source = torch.Generator(piece.observed.device)
-        source.manual_seed((seed * 1_000_003 + step) * 64 + number)
-        sink: list[RowGradient] = []
-        gain = None if light is None else light.gains()[piece.view]
-        loss, photometric = _as_field(model).loss(
-            piece.rays, piece.observed, piece.drop_mask, step, source, sink, gain
-        )
-        gradients = torch.autograd.grad(
-            loss * share, [parameter for _, parameter in dense], allow_unused=True
-        )
-        names = [name for name, _ in dense]
-        both = torch.stack([loss.detach(), photometric.detach()]) * share
-        return both, dict(zip(names, gradients, strict=True)), sink
+        source = torch.Generator().manual_seed((seed * 1_000_003 + step) * 64 + number)
+        share = piece.observed.shape[0] / rays
+        return found_in(model, light, steppers, piece, step, source, share)
 
     done = _map(pool, shard, len(pieces))
 
     def advance(number: int) -> None:
-        stepper = steppers[number]
-        gradients = [
-            _total(name, parameter, done)
-            for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
-        ]
-        stepper.step(step, gradients)
+        steppers[number].step(step, totals(steppers[number], done))
 
     _map(pool, advance, len(steppers))
-    return torch.stack([both for both, _, _ in done]).sum(0)
-
-
-def _total(
-    name: str,
-    parameter: nn.Parameter,
-    done: list[tuple[Tensor, dict[str, Tensor | None], list[RowGradient]]],
-) -> Tensor | None:
-    """One parameter's gradient over all shards, added in a fixed order."""
-    rows = [entry for _, _, sink in done for entry in sink if entry.table == name]
-    if rows:
-        places = torch.cat([entry.rows for entry in rows])
-        gradient = torch.cat([entry.gradient for entry in rows])
-        weights = [entry.weights for entry in rows if entry.weights is not None]
-        if not weights:
-            return add_single(places, gradient, parameter.shape[0])
-        return add_rows(places, torch.cat(weights), gradient, parameter.shape[0])
-    parts = [gradients[name] for _, gradients, _ in done]
-    found = [part for part in parts if part is not None]
-    return torch.stack(found).sum(0) if found else None
+    return torch.stack([piece.losses for piece in done]).sum(0)
 
 
 def _cut(batch: Batch, shards: int) -> list[Batch]:
@@ -300,11 +169,8 @@ def _map(pool: Executor | None, function: Callable[[int], T], count: int) -> lis
 
 
 @contextmanager
-def _pool(threads: int, device: str) -> Iterator[Executor | None]:
+def _pool(threads: int) -> Iterator[Executor | None]:
     """Threads for the shards, one core each: torch's own threads lose on work this small."""
-    if device != "cpu":
-        yield None
-        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -315,19 +181,6 @@ def _pool(threads: int, device: str) -> Iterator[Executor | None]:
                 yield pool
     finally:
         torch.set_num_threads(before)
-
-
-def _as_field(model: nn.Module) -> Field:
-    return model  # type: ignore[return-value]
-
-
-def _steppers(model: nn.Module, steps: int, rate: float) -> list[Stepper]:
-    named = dict(model.named_parameters())
-    parts = _as_field(model).parts()
-    listed = sorted(name for part in parts for name in part.parameters)
-    if listed != sorted(named):
-        raise ValueError("every parameter of a field must be in exactly one part")
-    return [Stepper(part, [named[name] for name in part.parameters], steps, rate) for part in parts]
 
 
 def _check_finite(loss: float, step: int) -> None:
@@ -345,17 +198,13 @@ def _state(
     record: Record,
     running: list[Tensor],
 ) -> dict[str, Tensor]:
-    state = {f"model:{name}": value.detach() for name, value in _named(learned)} | mean.state()
+    state = {f"model:{name}": value.detach() for name, value in named_in(learned)} | mean.state()
     for stepper in steppers:
         state |= stepper.state()
     state["record"] = torch.tensor(record.rows, dtype=torch.float64).reshape(-1, 3)
     # Losses since the last row: the row that they go into must not depend on a restart.
     state["running"] = torch.stack(running) if running else torch.zeros(0, 2)
     return state
-
-
-def _named(learned: list[nn.Module]) -> list[tuple[str, nn.Parameter]]:
-    return [entry for module in learned for entry in module.named_parameters()]
 
 
 def _restore(
@@ -367,7 +216,7 @@ def _restore(
 ) -> int:
     step, state = resume
     with torch.no_grad():
-        for name, parameter in _named(learned):
+        for name, parameter in named_in(learned):
             parameter.copy_(state[f"model:{name}"])
     for stepper in steppers:
         stepper.restore(state)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -51,6 +53,26 @@ class GridConfig:
     half: bool = False
 
 
+class Phase(NamedTuple):
+    """What a step does beside fitting colours: learns where surfaces are, leaves out the rays farthest off."""
+
+    learn_proposal: bool
+    trimmed: bool
+
+
+class Noise(NamedTuple):
+    """The random numbers of a step, in [0, 1].
+
+    Where in each bin ``(R, B)`` and how far off ``(3, R, B)`` the proposal is asked, and the sorted shares
+    of its weight ``(R, S)`` at which the samples lie. Half a cell off: on average the nearest cell is the
+    trilinear mixture.
+    """
+
+    in_bin: Tensor
+    shake: Tensor
+    along_weight: Tensor
+
+
 class GridField(nn.Module):
     """Position to density and features through the grid; features along the ray to colour.
 
@@ -60,6 +82,7 @@ class GridField(nn.Module):
     """
 
     plain = False
+    compiled: Callable[..., tuple[Tensor, Tensor]] | None = None
 
     def __init__(self, config: GridConfig, space: Space, seed: int) -> None:
         super().__init__()
@@ -79,8 +102,7 @@ class GridField(nn.Module):
     def render(self, rays: Rays) -> Rendering:
         """See :class:`pipeline.field.base.Field`."""
         with torch.no_grad():
-            proposed = self._propose(rays, None, None)
-            return self._shade(rays, proposed, None, None)
+            return self._shade(rays, self._propose(rays, None, None), None, None)
 
     def loss(
         self,
@@ -93,21 +115,49 @@ class GridField(nn.Module):
         gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :class:`pipeline.field.base.Field`."""
-        learn_proposal = step < 200 or step % 2 == 0
-        with torch.set_grad_enabled(learn_proposal):
-            proposed = self._propose(rays, generator, sink)
-        out = self._shade(rays, proposed.detach(), generator, sink)
+        phase, noise = self.phase(step), self._noise(rays, generator)
+        if self.compiled is not None:
+            return self.compiled(self, rays, observed, drop_mask, phase, noise, None, gain)
+        return self._losses(rays, observed, drop_mask, phase, noise, sink, gain)
+
+    def phase(self, step: int) -> Phase:
+        """See :class:`pipeline.field.base.Field`."""
+        return Phase(step < 200 or step % 2 == 0, self.config.trim > 0.0 and step >= 200)
+
+    def samples_per_ray(self) -> int:
+        """See :class:`pipeline.field.base.Field`."""
+        return self.config.samples
+
+    def _losses(
+        self,
+        rays: Rays,
+        observed: Tensor,
+        drop_mask: Tensor,
+        phase: Phase,
+        noise: Noise,
+        sink: list[RowGradient] | None,
+        gain: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        with torch.set_grad_enabled(phase.learn_proposal):
+            proposed = self._propose(rays, noise, sink)
+        out = self._shade(rays, proposed.detach(), noise, sink)
         rgb = out.rgb if gain is None else out.rgb * gain
         photometric = masked_photometric_loss(rgb, observed, drop_mask)
         total = photometric
-        if self.config.trim > 0.0 and step >= 200:
+        if phase.trimmed:
             total = masked_photometric_loss(rgb, observed, drop_mask, self.config.trim)
-        if learn_proposal:
+        if phase.learn_proposal:
             bound = fused.proposal_loss if self._fused(rays) else proposal_loss
             total = total + bound(out.edges, out.weights, proposed)
         if self.config.distortion > 0.0:
             total = total + self.config.distortion * distortion_loss(out.edges, out.weights)
         return total, photometric
+
+    def _noise(self, rays: Rays, generator: torch.Generator) -> Noise:
+        count, bins, near = rays.near.shape[0], self.config.bins, rays.near
+        along = torch.rand(count, bins, generator=generator, device=near.device)
+        shake = torch.rand(3, count, bins, generator=generator, device=near.device)
+        return Noise(along, shake, stratified(count, self.config.samples, generator, near))
 
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""
@@ -125,18 +175,11 @@ class GridField(nn.Module):
             Part("head", head, 1e-2, 0.03, betas, 1e-8, 50),
         ]
 
-    def _propose(
-        self, rays: Rays, generator: torch.Generator | None, sink: list[RowGradient] | None
-    ) -> Tensor:
+    def _propose(self, rays: Rays, noise: Noise | None, sink: list[RowGradient] | None) -> Tensor:
         """The proposal's weights ``(R, B)`` in equal bins of normalised depth."""
         bins, sizes = self.config.bins, self.config.proposal
-        count, device = rays.near.shape[0], rays.near.device
-        edges = self._walk(rays, torch.linspace(0, 1, bins + 1, device=device)[None])
-        along = shake = None
-        if generator is not None:
-            along = torch.rand(count, bins, generator=generator, device=device)
-            # Half a cell of noise: on average the nearest cell is the trilinear mixture.
-            shake = torch.rand(3, count, bins, generator=generator, device=device)
+        edges = self._walk(rays, torch.linspace(0, 1, bins + 1, device=rays.near.device)[None])
+        along, shake = (None, None) if noise is None else noise[:2]
         if self._fused(rays):
             rows, delta = fused.nearest_rows(edges, along, shake, sizes)
         else:
@@ -151,12 +194,12 @@ class GridField(nn.Module):
         self,
         rays: Rays,
         proposed: Tensor,
-        generator: torch.Generator | None,
+        noise: Noise | None,
         sink: list[RowGradient] | None,
     ) -> Rendering:
         """Colours and depths from samples where the proposal has its weight."""
         count, samples = rays.near.shape[0], self.config.samples
-        u = stratified(count, samples, generator, rays.near)
+        u = stratified(count, samples, None, rays.near) if noise is None else noise.along_weight
         mixed = proposed + 0.01 / self.config.bins
         if self._fused(rays):
             edges = fused.drawn_edges(mixed, u)
@@ -165,7 +208,7 @@ class GridField(nn.Module):
             edges = intervals_around(invert_histogram(mixed, u))
             x, delta = middles(self._walk(rays, edges))
         features = self.grid(x.view(3, -1), "grid.", sink, fast=self._fused(rays))
-        shape = self._shape(features, rays).view(count, samples, -1)
+        shape = self._shape(features).view(count, samples, -1)
         if self._fused(rays):
             weights, seen = fused.along_rays(shape, delta, MAX_LOG_DENSITY)
         else:
@@ -182,12 +225,12 @@ class GridField(nn.Module):
             opacity = 1.0 - torch.exp(-(sigma * delta).sum(-1))
         return Rendering(rgb, depth, opacity, weights, edges)
 
-    def _shape(self, features: Tensor, rays: Rays) -> Tensor:
+    def _shape(self, features: Tensor) -> Tensor:
         """Log density and what the colour is made of, ``(N, 16)``.
 
         A linear map beside the network: the tables learn through it from the first step.
         """
-        if self._fused(rays):
+        if not self.plain:
             inner, outer = self.shape_in, self.shape_out
             return fused.shape_network(
                 features, self.config.half, inner.weight, inner.bias, outer.weight, outer.bias,
@@ -204,7 +247,7 @@ class GridField(nn.Module):
         if self._fused(rays):
             return fused.walk(self.space, *rays, s)
         t = depth_at(s, rays.near[:, None], rays.far[:, None])
-        return self.space.warp(rays.rays_o[:, :, None] + rays.rays_d[:, :, None] * t)
+        return self.space.along(rays.rays_o, rays.rays_d, t)
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator, bias: bool = True) -> nn.Linear:

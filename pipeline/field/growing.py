@@ -53,8 +53,9 @@ class GrowingField:
         self.near = min(image.view.near for image in images)
         self.far = max(image.view.far for image in images) * far_factor
         views = [image.view for image in images]
-        field = build_around("fast", views, self.near, self.far, seed=seed, **config)
-        self.field = field.to(device)
+        self.field = build_around(
+            "fast", views, self.near, self.far, seed=seed, device=device, **config
+        )
         self.psnr: list[float] = []
 
     def fit(
@@ -69,7 +70,6 @@ class GrowingField:
             steps=steps,
             batch_rays=batch_rays,
             seed=seed,
-            shards=2 if self.device == "cpu" else 1,
             threads=threads,
         )
         self.psnr.append(record.rows[-1][2])

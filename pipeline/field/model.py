@@ -85,8 +85,10 @@ def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:
     }
 
 
-def half_is_fast() -> bool:
-    """Whether this processor multiplies bfloat16 numbers by itself, several times faster."""
+def half_is_fast(device: str = "cpu") -> bool:
+    """Whether this processor, or GPU, multiplies bfloat16 numbers by itself, several times faster."""
+    if device != "cpu":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
     features = get_host_cpu_features()
     return bool(features.get("avx512bf16") or features.get("amx-bf16"))
 
@@ -109,27 +111,30 @@ def build_around(
     seed: int = 0,
     resolution: int = 512,
     precision: str = "auto",
+    device: str = "cpu",
     **config: Any,
 ) -> GridField | PaperField:
     """A fresh field around what ``cameras`` see between the depths ``near`` and ``far``.
 
     ``space`` as in :func:`scene_space`; ``resolution`` vertices of the fast field's finest grid
-    along the longer side; ``precision`` of the fast field's products on a CPU is float32, bfloat16 or
-    auto: the latter where it is fast. ``config`` overrides fields of GridConfig (the paper's has none
-    here); samples and bins are raised to what a contracted space needs.
+    along the longer side; ``precision`` of the products is float32, bfloat16 or auto: the latter
+    where ``device``, on which the field lies, is fast at it (the paper's on a GPU alone). ``config``
+    overrides fields of GridConfig (the paper's has none here); samples and bins are raised to what a
+    contracted space needs.
     """
     cams = np.stack([camera.cam_from_world for camera in cameras])
     intrinsics = np.array([camera.intrinsics for camera in cameras])
     sizes = np.array([(camera.width, camera.height) for camera in cameras])
     around = scene_space(space, cams, intrinsics, sizes, near, far)
+    half = half_is_fast(device) if precision == "auto" else precision == "bfloat16"
     if model == "paper":
-        return build("paper", {}, around, seed)
-    half = half_is_fast() if precision == "auto" else precision == "bfloat16"
+        half = half and device != "cpu"
+        return build("paper", {"half": half}, around, seed).to(device)
     config = config | grid_sizes(around, resolution) | {"half": half}
     if around.kind == "contract":
         config["samples"] = max(config.get("samples", GridConfig.samples), CONTRACTED_SAMPLES)
         config["bins"] = max(config.get("bins", GridConfig.bins), CONTRACTED_BINS)
-    return build("fast", config, around, seed)
+    return build("fast", config, around, seed).to(device)
 
 
 def describe(field: GridField | PaperField) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +34,7 @@ class PaperConfig:
     final_rate: float = 5e-5
     steps: int = 200_000
     batch_rays: int = 1024
+    half: bool = False
 
 
 class PaperNetwork(nn.Module):
@@ -99,6 +101,14 @@ class PaperField(nn.Module):
         photometric = masked_photometric_loss(fine, observed, drop_mask)
         return photometric + masked_photometric_loss(coarse, observed, drop_mask), photometric
 
+    def phase(self, step: int) -> Hashable:
+        """See :class:`pipeline.field.base.Field`."""
+        return 0
+
+    def samples_per_ray(self) -> int:
+        """See :class:`pipeline.field.base.Field`."""
+        return self.config.coarse_samples + self.config.fine_samples
+
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""
         names = tuple(name for name, _ in self.named_parameters())
@@ -122,14 +132,17 @@ class PaperField(nn.Module):
         generator: torch.Generator | None,
     ) -> Rendering:
         t = depth_at(s, rays.near[:, None], rays.far[:, None])
-        x = self.space.warp(rays.rays_o[:, :, None] + rays.rays_d[:, :, None] * t)
+        x = self.space.along(rays.rays_o, rays.rays_d, t)
         step = x[:, :, 1:] - x[:, :, :-1]
         delta = 2.0 * step.square().sum(0).sqrt()
         delta = torch.cat([delta, torch.full_like(delta[:, :1], FAR_AWAY)], dim=-1)
         unit = (rays.rays_d / torch.linalg.vector_norm(rays.rays_d, dim=0)).t()
         directions = unit[:, None].expand(-1, s.shape[1], -1).reshape(-1, 3)
-        raw, colour = network(2.0 * x.reshape(3, -1).t() - 1.0, directions)
-        raw = raw.view(s.shape)
+        with torch.autocast(
+            s.device.type, torch.bfloat16, enabled=self.config.half, cache_enabled=False
+        ):
+            raw, colour = network(2.0 * x.reshape(3, -1).t() - 1.0, directions)
+        raw, colour = raw.float().view(s.shape), colour.float()
         if generator is not None and self.config.density_noise > 0.0:
             noise = torch.randn(raw.shape, generator=generator, device=raw.device)
             raw = raw + noise * self.config.density_noise

@@ -10,7 +10,8 @@ import torch
 from pipeline.field.base import Field, Rays
 from pipeline.geometry.rays import pixel_rays
 
-CHUNK = 2048  # what a core keeps in its cache; larger chunks are slower
+CHUNK = 2048  # rays: what a core keeps in its cache; larger chunks are slower
+CUDA_SAMPLES = 2**20  # at a time on a GPU, which has too little to do with fewer; one to two GB
 
 
 class RenderedView(NamedTuple):
@@ -43,25 +44,28 @@ def render_view(
     far: float,
     *,
     device: str = "cpu",
-    chunk: int = CHUNK,
+    chunk: int | None = None,
 ) -> RenderedView:
     """One view of the field. ``size`` is (width, height); depth is along z, in the poses' unit.
 
-    ``intrinsics`` are fx, fy, cx, cy, k1. Memory is bounded by ``chunk`` rays. The same bytes for
-    the same chunk, whatever runs beside it.
+    ``intrinsics`` are fx, fy, cx, cy, k1. Memory is bounded by ``chunk`` rays at a time (None: what
+    suits the device). The same bytes for the same chunk, whatever runs beside it.
     """
     width, height = size
+    if chunk is None:
+        chunk = CHUNK if device == "cpu" else max(1, CUDA_SAMPLES // field.samples_per_ray())
     pose = torch.from_numpy(np.asarray(cam_from_world, np.float32)[:3, :4]).to(device)
     camera = torch.tensor(intrinsics, dtype=torch.float32, device=device)
     parts = []
     for start in range(0, width * height, chunk):
         pixel = torch.arange(start, min(start + chunk, width * height), device=device)
         rows = torch.div(pixel, width, rounding_mode="floor")
-        rays_o, rays_d = pixel_rays(pixel - rows * width, rows, camera, pose)
+        distorted = intrinsics[4] != 0
+        rays_o, rays_d = pixel_rays(pixel - rows * width, rows, camera, pose, distorted)
         bounds = [torch.full_like(rays_d[0], value) for value in (near, far)]
         out = field.render(Rays(rays_o.contiguous(), rays_d, *bounds))
-        parts.append(torch.cat([out.rgb, out.depth[:, None], out.opacity[:, None]], 1).cpu())
-    pixels = torch.cat(parts).view(height, width, 5).numpy()
+        parts.append(torch.cat([out.rgb, out.depth[:, None], out.opacity[:, None]], 1))
+    pixels = torch.cat(parts).cpu().view(height, width, 5).numpy()
     return RenderedView(
         np.ascontiguousarray(pixels[..., :3]),
         np.ascontiguousarray(pixels[..., 3]),

@@ -16,8 +16,6 @@ def undistort(
     Solves ``x_distorted = x (1 + k1 (x^2 + y^2))`` by fixed-point iteration, which converges for
     the lenses of cameras and phones (``|k1| r^2`` below about 0.3). All shapes broadcast.
     """
-    if not bool((k1 != 0).any()):
-        return x, y
     u, v = x, y
     for _ in range(steps):
         gain = 1.0 + k1 * (u * u + v * v)
@@ -26,7 +24,11 @@ def undistort(
 
 
 def pixel_rays(
-    columns: Tensor, rows: Tensor, intrinsics: Tensor, cam_from_world: Tensor
+    columns: Tensor,
+    rows: Tensor,
+    intrinsics: Tensor,
+    cam_from_world: Tensor,
+    distorted: bool | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Origins and directions ``(3, N)`` of the rays through pixel centres, components first.
 
@@ -34,11 +36,13 @@ def pixel_rays(
     (0.5, 0.5)); ``intrinsics`` ``(N, 5)`` or ``(5,)`` holds fx, fy, cx, cy, k1;
     ``cam_from_world`` ``(N, 3, 4)`` or ``(3, 4)``. The direction has length 1 along the camera's
     optical axis, so the ray parameter ``t`` is the depth along z, in the unit of the poses.
+    ``distorted``: whether any k1 is not 0; None looks, for which a GPU has to be waited for.
     """
     fx, fy, cx, cy, k1 = intrinsics.unbind(-1)
     x = (columns.to(intrinsics.dtype) + 0.5 - cx) / fx
     y = (rows.to(intrinsics.dtype) + 0.5 - cy) / fy
-    x, y = undistort(x, y, k1)
+    if bool((k1 != 0).any()) if distorted is None else distorted:
+        x, y = undistort(x, y, k1)
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
     # world_from_cam applies the transposed rotation: rows of R are the camera axes in the world.
     rays_d = torch.stack(

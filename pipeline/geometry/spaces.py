@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.geometry.constants import constant
+
 # A corner ray steeper than this against the mean optical axis would leave the frustum that
 # normalised device coordinates can hold.
 MAX_CORNER_ANGLE_DEG = 65.0
@@ -58,15 +60,35 @@ class Space:
 
     def warp(self, points: Tensor) -> Tensor:
         """Coordinates in [0, 1] of world points, both ``(3, ...)``; clamped at the bounds."""
-        flat = points.reshape(3, -1)
-        matrix = torch.tensor(self.ref_from_world, dtype=flat.dtype, device=flat.device)
-        ref = torch.addmm(matrix[:, 3:], matrix[:, :3], flat)
+        return self.cube(self.ref(points))
+
+    def along(self, rays_o: Tensor, rays_d: Tensor, t: Tensor) -> Tensor:
+        """Coordinates in [0, 1], ``(3, R, K)``, at the depths ``t`` ``(R, K)`` of rays ``(3, R)``."""
+        return self.cube(
+            torch.addcmul(self.ref(rays_o)[..., None], self.turned(rays_d)[..., None], t)
+        )
+
+    def ref(self, points: Tensor) -> Tensor:
+        """World points ``(3, ...)`` in the space's own frame."""
+        shift = constant(tuple((row[3],) for row in self.ref_from_world), points)
+        return self.turned(points) + shift.view(3, *[1] * (points.dim() - 1))
+
+    def turned(self, directions: Tensor) -> Tensor:
+        """World directions ``(3, ...)`` in the space's own frame.
+
+        No matrix product: a GPU may round those to ten bits, too few for a place.
+        """
+        rows = constant(tuple(row[:3] for row in self.ref_from_world), directions)
+        return (rows.view(3, 3, *[1] * (directions.dim() - 1)) * directions).sum(1)
+
+    def cube(self, ref: Tensor) -> Tensor:
+        """Coordinates in [0, 1] of points ``(3, ...)`` in the space's own frame."""
         mapped = ndc(ref, self.near) if self.kind == "ndc" else contract(ref)
-        scale = [[1.0 / (b - a)] for a, b in zip(self.low, self.high, strict=True)]
-        shift = [[-a / (b - a)] for a, b in zip(self.low, self.high, strict=True)]
-        factor = torch.tensor(scale, dtype=flat.dtype, device=flat.device)
-        offset = torch.tensor(shift, dtype=flat.dtype, device=flat.device)
-        return torch.addcmul(offset, mapped, factor).clamp_(0.0, 1.0).view(points.shape)
+        sides = list(zip(self.low, self.high, strict=True))
+        shape = (3, *[1] * (ref.dim() - 1))
+        factor = constant(tuple(1.0 / (b - a) for a, b in sides), ref).view(shape)
+        offset = constant(tuple(-a / (b - a) for a, b in sides), ref).view(shape)
+        return torch.addcmul(offset, mapped, factor).clamp_(0.0, 1.0)
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists that :meth:`from_json` takes back."""

@@ -1,0 +1,207 @@
+"""What steps a fit's parameters: gradients of a batch in, Adam's steps, and their mean at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.field.base import Field, Part
+from pipeline.field.buffer import Batch
+from pipeline.field.encoding import RowGradient, add_rows, add_single
+
+
+class Exposure(nn.Module):
+    """One factor per photo and channel between the scene and the photo; their mean is 1.
+
+    The mean is taken of the logarithms: what all photos share is the scene's own brightness.
+    """
+
+    def __init__(self, photos: int) -> None:
+        super().__init__()
+        self.log_gain = nn.Parameter(torch.zeros(photos, 3))
+
+    def gains(self) -> Tensor:
+        """``(V, 3)`` factors."""
+        return torch.exp(self.log_gain - self.log_gain.mean(0))
+
+    def parts(self) -> list[Part]:
+        """How it is stepped."""
+        return [Part("log_gain", ("log_gain",), 1e-2, 0.1, warmup=50)]
+
+
+class Stepper:
+    """Adam for one part of a field, at a rate that depends on the step alone."""
+
+    def __init__(
+        self, part: Part, parameters: list[nn.Parameter], steps: int, rate: float = 1.0
+    ) -> None:
+        self.part, self.parameters, self.steps = part, parameters, steps
+        self.rate = part.rate * rate
+        self.adam = torch.optim.AdamW(
+            parameters,
+            lr=self.rate,
+            betas=part.betas,
+            eps=part.eps,
+            weight_decay=part.decay,
+            fused=True,
+        )
+
+    def rate_at(self, step: int) -> float:
+        """The rate of a step."""
+        rate = self.rate * self.part.final ** (step / self.steps)
+        return rate * min(1.0, (step + 1) / self.part.warmup) if self.part.warmup else rate
+
+    def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
+        """One step with the given gradients; none at all leaves the part as it is."""
+        self.adam.param_groups[0]["lr"] = self.rate_at(step)
+        self.apply(gradients)
+
+    def apply(self, gradients: Sequence[Tensor | None]) -> None:
+        """As :meth:`step`, at the rate that was set last."""
+        if all(gradient is None for gradient in gradients):
+            return
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.adam.step()
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    def state(self) -> dict[str, Tensor]:
+        """Adam's running moments by name; what :meth:`restore` takes back."""
+        out = {}
+        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
+            for key, value in self.adam.state[parameter].items():
+                out[f"{key}:{name}"] = value
+        return out
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continue from :meth:`state`."""
+        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
+            for key in ("step", "exp_avg", "exp_avg_sq"):
+                if f"{key}:{name}" in state:
+                    self.adam.state[parameter][key] = state[f"{key}:{name}"].clone()
+
+
+class Average:
+    """The mean of parameters over the last ``steps - start`` of ``steps`` steps, every tenth and the last.
+
+    Rates of Adam's kind leave parameters wandering about where they have arrived; their mean is
+    nearer to it than any of them (Polyak and Juditsky, doi:10.1137/0330046).
+    """
+
+    EVERY = 10
+
+    def __init__(self, learned: list[nn.Module], steps: int, share: float) -> None:
+        self.named, self.steps, self.span = named_in(learned), steps, round(share * steps)
+        self.means: dict[str, Tensor] = {}
+
+    def add(self, done: int) -> None:
+        """The parameters as they are after ``done`` steps, if these count."""
+        left = self.steps - done
+        if left >= self.span or left % self.EVERY:
+            return
+        number = (self.span - 1) // self.EVERY - left // self.EVERY + 1
+        for name, parameter in self.named:
+            if number == 1:
+                self.means[name] = parameter.detach().clone()
+            else:
+                self.means[name].lerp_(parameter.detach(), 1.0 / number)
+
+    def finish(self) -> None:
+        """Gives every parameter its mean, if there is one."""
+        with torch.no_grad():
+            for name, parameter in self.named:
+                if name in self.means:
+                    parameter.copy_(self.means[name])
+
+    def state(self) -> dict[str, Tensor]:
+        """The means by name; what :meth:`restore` takes back."""
+        return {f"mean:{name}": value for name, value in self.means.items()}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continue from :meth:`state`."""
+        names = [name for name, _ in self.named if f"mean:{name}" in state]
+        self.means = {name: state[f"mean:{name}"].clone() for name in names}
+
+
+class Found(NamedTuple):
+    """Of one piece of a batch: (loss, photometric loss), gradients by name, rows still to be added."""
+
+    losses: Tensor
+    gradients: dict[str, Tensor | None]
+    sink: list[RowGradient]
+
+
+def found_in(
+    model: nn.Module,
+    light: Exposure | None,
+    steppers: Sequence[Stepper],
+    piece: Batch,
+    step: int,
+    source: torch.Generator,
+    share: float,
+) -> Found:
+    """The losses and gradients of a piece that is ``share`` of its batch."""
+    named = {
+        name: parameter
+        for stepper in steppers
+        for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
+    }
+    sink: list[RowGradient] = []
+    gain = None if light is None else light.gains().index_select(0, piece.view)
+    loss, photometric = as_field(model).loss(
+        piece.rays, piece.observed, piece.drop_mask, step, source, sink, gain
+    )
+    gradients = torch.autograd.grad(loss * share, list(named.values()), allow_unused=True)
+    both = torch.stack([loss.detach(), photometric.detach()]) * share
+    return Found(both, dict(zip(named, gradients, strict=True)), sink)
+
+
+def total(name: str, parameter: nn.Parameter, found: Sequence[Found]) -> Tensor | None:
+    """One parameter's gradient over all pieces, added in a fixed order."""
+    rows = [entry for piece in found for entry in piece.sink if entry.table == name]
+    if rows:
+        places = _joined([entry.rows for entry in rows])
+        gradient = _joined([entry.gradient for entry in rows])
+        weights = [entry.weights for entry in rows if entry.weights is not None]
+        if not weights:
+            return add_single(places, gradient, parameter.shape[0])
+        return add_rows(places, _joined(weights), gradient, parameter.shape[0])
+    parts = [piece.gradients[name] for piece in found]
+    dense = [part for part in parts if part is not None]
+    if len(dense) == 1:
+        return dense[0]
+    return torch.stack(dense).sum(0) if dense else None
+
+
+def totals(stepper: Stepper, found: Sequence[Found]) -> list[Tensor | None]:
+    """The gradients of all of a part's parameters."""
+    pairs = zip(stepper.part.parameters, stepper.parameters, strict=True)
+    return [total(name, parameter, found) for name, parameter in pairs]
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def as_field(model: nn.Module) -> Field:
+    """A field that is a module."""
+    return model  # type: ignore[return-value]
+
+
+def steppers_of(model: nn.Module, steps: int, rate: float) -> list[Stepper]:
+    """One for each part of a field."""
+    named = dict(model.named_parameters())
+    parts = as_field(model).parts()
+    listed = sorted(name for part in parts for name in part.parameters)
+    if listed != sorted(named):
+        raise ValueError("every parameter of a field must be in exactly one part")
+    return [Stepper(part, [named[name] for name in part.parameters], steps, rate) for part in parts]
+
+
+def named_in(learned: list[nn.Module]) -> list[tuple[str, nn.Parameter]]:
+    """All parameters that are learned, by name."""
+    return [entry for module in learned for entry in module.named_parameters()]
