@@ -41,8 +41,9 @@ class CudaSteps:
         record: bool,
     ) -> None:
         self.model, self.light, self.steppers, self.buffer = model, light, steppers, buffer
-        self.seed, self.record, self.batch_rays = seed, record, batch_rays
+        self.seed, self.batch_rays = seed, batch_rays
         device = torch.device(buffer.device)
+        self.record = record and device.type == "cuda"
         self.pixels = buffer.pixels(0, batch_rays).clone()
         steps = max(stepper.steps for stepper in steppers)
         rates = [[stepper.rate_at(step) for stepper in steppers] for step in range(steps)]

@@ -89,7 +89,7 @@ def test_the_steps_of_a_gpu_are_those_of_a_cpu(photos: list[PosedPhoto], plain: 
                  log_every=1, **HOW)  # fmt: skip
     assert losses == pytest.approx([row[1] for row in record.rows], rel=1e-6)
     for one, other in zip(models[0].parameters(), models[1].parameters(), strict=True):
-        assert float((one - other).norm() / other.norm()) < 1e-3
+        assert float((one - other).norm() / other.norm()) < 1e-2
 
 
 def test_phases_tell_which_steps_do_the_same(photos: list[PosedPhoto]) -> None:
@@ -104,12 +104,12 @@ def test_phases_tell_which_steps_do_the_same(photos: list[PosedPhoto]) -> None:
 def test_a_fit_on_the_gpu_reaches_what_the_cpu_reaches(
     photos: list[PosedPhoto], half: bool, record: bool
 ) -> None:
-    found = {}
+    found: dict[str, float] = {}
     for device in ("cpu", "cuda"):
         model = field(photos, half=half).to(device)
         fit(model, RayBuffer(photos[1:], 0, device), steps=400, average=0.2, record=record, **HOW)
         found[device] = psnr(model, photos[1:], device)
-    assert found["cuda"] == pytest.approx(found["cpu"], abs=0.5), found
+    assert found["cuda"] == pytest.approx(found["cpu"], abs=0.7), found
 
 
 @needs_gpu
