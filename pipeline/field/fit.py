@@ -36,6 +36,7 @@ T = TypeVar("T")
 
 Progress = Callable[[int, float, float], None]
 Save = Callable[[int, dict[str, Tensor]], None]
+Take = Callable[[int], Tensor]  # a step's number in, (loss, photometric loss) out
 
 
 @dataclass
@@ -89,16 +90,11 @@ def fit(
     if resume is not None:
         first = _restore(learned, steppers, mean, course, resume)
         running = list(resume[1]["running"])
-    on_gpu = buffer.device != "cpu"
-    with _pool(1 if on_gpu else threads) as pool:
-
-        def on_cpu(step: int) -> Tensor:
-            batch = buffer.batch(step, batch_rays)
-            return _one_step(model, light, steppers, batch, step, seed, shards, pool)
-
-        take: Callable[[int], Tensor] = on_cpu
-        if on_gpu:
-            take = CudaSteps(model, light, steppers, buffer, batch_rays, seed, record)
+    with _pool(threads if buffer.device == "cpu" else 1) as pool:
+        if buffer.device != "cpu":
+            take: Take = CudaSteps(model, light, steppers, buffer, batch_rays, seed, record)
+        else:
+            take = _on_cpu(model, light, steppers, buffer, batch_rays, seed, shards, pool)
         for step in range(first, steps):
             running.append(take(step))
             done = step + 1
@@ -121,6 +117,25 @@ def _row(done: int, losses: list[Tensor]) -> tuple[int, float, float]:
     loss, photometric = torch.stack(losses).mean(0).tolist()
     _check_finite(loss, done - 1)
     return done, loss, -10.0 * math.log10(max(photometric, 1e-12))
+
+
+def _on_cpu(
+    model: nn.Module,
+    light: Exposure | None,
+    steppers: list[Stepper],
+    buffer: RayBuffer,
+    batch_rays: int,
+    seed: int,
+    shards: int,
+    pool: Executor | None,
+) -> Take:
+    """What takes a step on a CPU."""
+
+    def take(step: int) -> Tensor:
+        batch = buffer.batch(step, batch_rays)
+        return _one_step(model, light, steppers, batch, step, seed, shards, pool)
+
+    return take
 
 
 def _one_step(
