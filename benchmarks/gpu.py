@@ -79,7 +79,7 @@ class Bench:
         if self.tiny:
             self.settings |= {"levels": 2, "table_log2": 10, "samples": 6, "resolution": 48}
             self.settings |= {"batch_rays": 128, "steps": 12}
-        self.go = flags.go
+        self.go, self.record = flags.go, not flags.eager
         self.end, self.out = time.perf_counter() + flags.seconds, flags.out
         self.scenes = read(flags.scenes, 8 if self.tiny else 1) if flags.scenes else {}
 
@@ -138,7 +138,7 @@ class Bench:
         buffer, begin = self.buffer(shots, kind), self.wait()
         model = self.field(shots, **change)
         fit(model, buffer, steps=steps, batch_rays=settings["batch_rays"], seed=0,
-            average=settings["average"], log_every=100, progress=progress)  # fmt: skip
+            average=settings["average"], log_every=100, progress=progress, record=self.record)  # fmt: skip
         return model, self.wait() - begin
 
     def step_ms(self, model: Any, buffer: RayBuffer, rays: int, how: str, steps: int = 60) -> float:
@@ -154,7 +154,7 @@ class Bench:
             model.compiled = torch.compile(GridField._losses, dynamic=False)
         torch.backends.cuda.matmul.allow_tf32 = "tf32" in how
         steppers = steppers_of(model, 10_000, 1.0)
-        take = CudaSteps(model, None, steppers, buffer, rays, 0, "graph" in how)
+        take = CudaSteps(model, None, steppers, buffer, rays, 0, self.record and "graph" in how)
         for step in range(200, 203 if self.tiny else 212):
             take(step)
         self.wait()
@@ -418,7 +418,7 @@ def paper_course(
 
     with contextlib.suppress(OutOfTime):
         fit(model, buffer, steps=bench.settings["paper_steps"], batch_rays=rays, seed=0,
-            log_every=10, progress=look)  # fmt: skip
+            log_every=10, progress=look, record=bench.record)  # fmt: skip
     yield from told
 
 
@@ -429,7 +429,8 @@ def boxes_part(bench: Bench) -> Iterator[str]:
         train, test, model = photos_and_field("fast", bench.settings, size=size)
         model = model.to(bench.device)
         buffer, begin = RayBuffer(train, 0, bench.device), bench.wait()
-        fit(model, buffer, steps=steps, batch_rays=bench.settings["batch_rays"], seed=0)
+        rays = bench.settings["batch_rays"]
+        fit(model, buffer, steps=steps, batch_rays=rays, seed=0, record=bench.record)
         took = bench.wait() - begin
         photo = test[0]
         seen = render_view(model, photo.cam_from_world, photo.intrinsics, size, photo.near,
@@ -481,6 +482,7 @@ def main() -> None:
     parser.add_argument("--tiny", action="store_true", help="sizes that only show that it runs")
     parser.add_argument("--seconds", type=float, default=150.0)
     parser.add_argument("--go", type=Path, help="wait for this file between compiling and timing")
+    parser.add_argument("--eager", action="store_true", help="record no step")
     parser.add_argument("--parts", default=",".join(PARTS))
     flags = parser.parse_args()
     if flags.pack:
