@@ -23,6 +23,7 @@ from pipeline.evaluation.masks import mask_counts, mask_scores
 from pipeline.evaluation.references import find_references, read_reference
 from pipeline.evaluation.rounds import score_rounds
 from pipeline.evaluation.score import Files
+from pipeline.io.accounts import REFINE
 from pipeline.io.atomic import read_json
 from pipeline.io.images import as_bytes, read_image, write_image
 from pipeline.io.masks import read_keep_mask
@@ -44,7 +45,7 @@ def table(root: Path, scene: str, covered: float = COVERED) -> list[str]:
                       None, clean.get(r.name), coverage.get(r.name))
         for r in records
     }  # fmt: skip
-    about = read_json(paths.refine / "refine.json", made_by="refine")
+    about = read_json(paths.refine / "refine.json", "refine", REFINE)
     shares, counts = [], []
     for name, one in files.items():
         drop_mask = ~read_keep_mask(paths.masks / name, one.record.size)

@@ -52,8 +52,10 @@ def main(job: Job, params: Params) -> str:
     with publish_dir(job.paths.images) as fresh:
         if capture.video is not None:
             fewest, longest = params.min_images, params.max_size
-            records = save_frames(capture.video, fresh, params.frames, longest, at_least=fewest)
-            origin = Origin(kind="video")
+            records, said = save_frames(
+                capture.video, fresh, params.frames, longest, at_least=fewest
+            )
+            origin = Origin(kind="video", said=said)
         else:
             records, origin = _from_photos(job, capture, fresh, params)
         write_images_json(fresh, with_split(records, params.holdout), origin)
@@ -83,7 +85,7 @@ def _from_photos(
         },
         job_label="writing images", scheduler=job.scheduler,
     )  # fmt: skip
-    records = intake.photo_records(capture, photos, plan, size, job.paths.data)
+    records = intake.photo_records(capture, photos, plan, size, job.paths.data, straighten)
     if capture.views:
         write_transforms(folder / GIVEN_POSES, intake.given_views(capture, plan, size, straighten))
     share = intake.write_given_masks(folder / GIVEN_MASKS, capture, photos, plan, size, straighten)

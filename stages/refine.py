@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.field.growing import GrowingField
+from pipeline.io.accounts import MASKS
 from pipeline.io.atomic import publish_dir, read_json, write_json
 from pipeline.io.images import write_image
 from pipeline.io.maps import read_map, write_map
@@ -50,7 +51,7 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Makes `refine/` from the images, their masks, attention maps and poses."""
     paths = job.paths
-    given = read_json(paths.masks / "masks.json", made_by="masks").get("mode") == "given"
+    given = read_json(paths.masks / "masks.json", "masks", MASKS)["mode"] == "given"
     if given or not params.rounds:
         why = "they came with the photos" if given else "refine.rounds is 0"
         with publish_dir(paths.refine) as fresh:

@@ -19,7 +19,7 @@ from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.images import as_bytes, read_image, write_image
 from pipeline.io.maps import read_depth, write_depth, write_map
 from pipeline.io.masks import read_keep_mask
-from pipeline.io.scene import read_images_json
+from pipeline.io.posed import posed_records
 from pipeline.io.transforms import View, read_transforms
 from pipeline.io.video import write_video
 from pipeline.parallel import map_named
@@ -32,7 +32,7 @@ class Params(Section):
     views: Literal["all", "test"]
     feather_px: Annotated[float, Field(ge=0, le=100)]
     gain_px: Annotated[float, Field(ge=1, le=1000)]
-    path_frames: Annotated[int, Field(ge=0, le=10_000)]
+    path_frames: Literal[0] | Annotated[int, Field(ge=2, le=10_000)]
     path_scale: Annotated[float, Field(gt=0, le=2)]
     path_fps: Annotated[int, Field(ge=1, le=120)]
     seen_counts: bool
@@ -42,8 +42,7 @@ def main(job: Job, params: Params) -> str:
     """Makes `views/` from the field, the poses, the images and the masks."""
     paths = job.paths
     views = read_transforms(paths.poses / "transforms.json")
-    splits = ("train", "test") if params.views == "all" else ("test",)
-    records = [r for r in read_images_json(paths.images) if r.name in views and r.split in splits]
+    records = posed_records(paths.images, views, held_out_alone=params.views == "test")
     workers = 1 if job.device != "cpu" else None  # on a CPU each core takes a view
     how: dict[str, Any] = {"scheduler": job.scheduler, "workers": workers}
     load_field(paths.nerf, job.device)  # a missing field is told before the work begins
@@ -58,9 +57,9 @@ def main(job: Job, params: Params) -> str:
             train = tuple(views[r.name] for r in records if r.split == "train")
             items = {r.name: (views[r.name], train, paths.refine, fresh) for r in records}
             write_json(fresh / "seen.json", map_named(_count_seen, items, job_label="seen", **how))
-        if params.path_frames > 1 and len(views) > 1:
+        if filmed := params.path_frames if len(views) > 1 else 0:
             _film(job, params, list(views.values()), fresh, how)
-    return f"{len(records)} views, {params.path_frames} frames of video"
+    return f"{len(records)} views, {filmed} frames of video"
 
 
 def _render(nerf: Path, device: str, view: View, pose: np.ndarray, scale: float) -> RenderedView:

@@ -9,7 +9,9 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import publish_dir, read_json, write_text
+from pipeline.io import accounts
+from pipeline.io.accounts import read_if_there
+from pipeline.io.atomic import publish_dir, write_text
 from pipeline.io.paths import ScenePaths
 from pipeline.io.scene import ImageRecord, read_images_json, read_origin
 from pipeline.parallel import map_named
@@ -37,7 +39,7 @@ def main(job: Job, params: Params) -> str:
             "a variant has no page of its own; the scene's page shows it beside the scene.",
             f"Set report.compare: {job.variant} and leave --variant away.",
         )
-    metrics = read_json(paths.metrics, made_by="evaluate")
+    metrics = accounts.read_metrics(paths.metrics)
     other_paths, other, unmet = _other(job, params.compare)
     records = read_images_json(paths.images)
     pictures = map_named(
@@ -46,7 +48,9 @@ def main(job: Job, params: Params) -> str:
         job_label="report",
         scheduler=job.scheduler,
     )
-    account = gather.optional_json(paths.poses / "poses.json")
+    account = read_if_there(paths.poses / "poses.json", "poses", accounts.POSES)
+    masks = read_if_there(paths.masks / "masks.json", "masks", accounts.MASKS)
+    refined = read_if_there(paths.refine / "refine.json", "refine", accounts.REFINE)
     lost = gather.lost_images(account)
     heat, heat_max = gather.coverage_heat(paths, records, params.picture_size, params.quality)
     film, film_missing = gather.video(paths.views / "path.mp4")
@@ -60,10 +64,7 @@ def main(job: Job, params: Params) -> str:
         charts=charts(paths, other_paths, records),
         coverage=heat,
         coverage_max=heat_max,
-        masks_note=notes.masks_note(gather.optional_json(paths.masks / "masks.json"))
-        + notes.rounds_note(
-            gather.optional_json(paths.refine / "refine.json"), metrics.get("rounds", {})
-        ),
+        masks_note=notes.masks_note(masks) + notes.rounds_note(refined, metrics.get("rounds", {})),
         poses_note=notes.poses_note(account, len(records)),
         lost=lost,
         tried=gather.attempts(account),
@@ -85,8 +86,8 @@ def _other(
     if variant == ".":
         return None, {}, []
     paths = ScenePaths(job.root, job.scene, variant)
-    if metrics := gather.optional_json(paths.metrics):
-        return paths, metrics, []
+    if paths.metrics.is_file():
+        return paths, accounts.read_metrics(paths.metrics), []
     unmet = numbers.unmet(job.scene, variant)
     log.warning("%s", unmet[0][0])
     return None, {}, unmet
@@ -99,7 +100,7 @@ def _photos(
     lost: Mapping[str, str],
 ) -> list[Photo]:
     rows = gather.image_numbers(paths.metrics_csv)
-    seen = gather.optional_json(paths.views / "seen.json")
+    seen = read_if_there(paths.views / "seen.json", "render", accounts.SEEN)
     photos = []
     for record in records:
         name, ratio = record.name, record.width / record.height

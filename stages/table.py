@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import publish_dir, read_json, write_text
+from pipeline.io.accounts import read_metrics
+from pipeline.io.atomic import publish_dir, write_text
 from pipeline.io.images import read_image, write_image
 from pipeline.io.masks import read_keep_mask
 from pipeline.io.paths import ScenePaths
@@ -51,7 +52,7 @@ def main(job: Job, params: Params) -> str:
                 if not paths.metrics.is_file():
                     missing[scene, row.id] = _why(row, scene, params)
                     continue
-                metrics = read_json(paths.metrics, made_by="evaluate")
+                metrics = read_metrics(paths.metrics)
                 poses[scene], conventions = metrics["poses"], metrics["conventions"]
                 scores = view_scores(paths.metrics_csv.read_text(encoding="utf-8"), row)
                 if row.id in ("unaveraged", "derain", "loop"):
@@ -108,9 +109,8 @@ def _strip(paths: ScenePaths, seed: int, out: Path) -> None:
     corner = busiest_window(water[name].astype(np.float32), size)
     files = {"wet photo": small / "images" / name}
     for label, variant in PICTURES.items():
-        files[label] = (
-            ScenePaths(paths.root, paths.scene, variant.format(seed)).views / "test" / name
-        )
+        fit = ScenePaths(paths.root, paths.scene, variant.format(seed))
+        files[label] = fit.views / "test" / name
     files["clean photo"] = small / "clean" / name
     pictures = {label: read_image(path) for label, path in files.items() if path.is_file()}
     write_image(out, side_by_side(pictures, corner, size, scale=2 if size[0] <= 100 else 1))

@@ -24,6 +24,7 @@ RUNNER = {
     "pipeline.io",
     "pipeline.io.atomic",
     "pipeline.io.paths",
+    "pipeline.io.shapes",
 }
 
 

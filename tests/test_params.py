@@ -186,3 +186,18 @@ def test_a_variant_may_find_folders_elsewhere(tmp_path: Path) -> None:
     for folders in ({"images": "../../elsewhere"}, {"nerf": "a"}, {"masks": "/etc"}):
         with pytest.raises(UserError, match="cannot find its"):
             ScenePaths(tmp_path, "demo", "wide", folders)
+
+
+def test_scratch_of_scenes_and_variants_never_meets(tmp_path: Path) -> None:
+    """A scene `a-b` and the variant `b` of `a` worked in one folder."""
+    both = ScenePaths(tmp_path, "a-b").work("nerf"), ScenePaths(tmp_path, "a", "b").work("nerf")
+    assert both[0] != both[1]
+    assert ScenePaths(tmp_path, "a", "nerf-2").work("nerf") != ScenePaths(tmp_path, "a").work(
+        "nerf"
+    )
+
+
+@pytest.mark.parametrize("name", ["masks", "images", "views", "metrics.json", "report"])
+def test_a_variant_does_not_take_the_name_of_its_scenes_folder(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UserError, match=f"artifacts/demo/{name} is the scene's own"):
+        ScenePaths(tmp_path, "demo", name)

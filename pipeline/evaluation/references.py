@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.io.images import PHOTO_SUFFIXES, image_size, read_photo, turn
+from pipeline.io.lenses import straightener
 from pipeline.io.scene import ImageRecord, image_name
 
 
@@ -45,11 +46,14 @@ def find_references(folder: Path, records: Sequence[ImageRecord]) -> dict[str, P
 def read_reference(path: Path, record: ImageRecord, source: Path) -> np.ndarray:
     """The reference (H, W, 3) float32 in [0, 1], as `ingest` made the image of its photo.
 
-    It is made upright, turned by `record.turned`, and scaled down by area averaging when it has the
-    size of the photo `source` rather than of the image. UserError when it has neither size.
+    It is made upright, turned by `record.turned`, straightened where the photo was, and scaled down by
+    area averaging when it has the size of the photo `source` rather than of the image. UserError when
+    it has neither size.
     """
     stored, info = read_photo(path)
     pixels = turn(stored, info.upright_turn + record.turned)
+    if record.lens is not None:
+        pixels = straightener(record.lens)(pixels)
     height, width = pixels.shape[:2]
     if (width, height) != record.size:
         photo = sorted(image_size(source)) if source.is_file() else []

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import read_json
+from pipeline.io.accounts import read_metrics
 
 # Heading, dotted name, format. Higher is better but for LPIPS and FLIP.
 COLUMNS = (
@@ -108,7 +108,7 @@ def main(paths: Sequence[str]) -> int:
         print("usage: python -m pipeline.evaluation.table METRICS.json ...", file=sys.stderr)
         return 2
     try:
-        fits = {label_of(Path(path)): read_json(Path(path), made_by="evaluate") for path in paths}
+        fits = {label_of(Path(path)): read_metrics(Path(path)) for path in paths}
     except UserError as error:
         print(error, file=sys.stderr)
         return 2

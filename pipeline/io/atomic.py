@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.io.shapes import Shape, misfit
 
 # Of places rather than of programs: who looks at the file or folder that is named can mend it.
 _PLACES = (
@@ -163,8 +164,11 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, made_by: str = "") -> dict[str, Any]:
-    """The object in a JSON file; UserError when it is missing or damaged, naming the stage that makes it."""
+def read_json(path: Path, made_by: str = "", shape: Shape = dict[str, Any]) -> dict[str, Any]:
+    """The object in a JSON file, of a `shape` (see `pipeline.io.shapes`).
+
+    UserError when it is missing, damaged or of another shape, naming the stage that makes it.
+    """
     hint = f"Run `python -m stages.{made_by}` first." if made_by else "Restore the file."
     again = hint.replace("first", "again")
     try:
@@ -177,6 +181,8 @@ def read_json(path: Path, made_by: str = "") -> dict[str, Any]:
         raise UserError(f"{path} is damaged: {error}.", again) from None
     if not isinstance(content, dict):
         raise UserError(f"{path} is damaged: it holds a {type(content).__name__}.", again)
+    if fault := misfit(content, shape):
+        raise UserError(f"{path} is damaged: {fault}.", again)
     return content
 
 

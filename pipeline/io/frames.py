@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from pipeline.io.scene import ImageRecord
 
 GLANCE_PX = 160  # longest side of the small picture in which motion is measured
 LOOK_PX = 480  # longest side of the picture in which sharpness is measured
+SHORT, SHORT_SECONDS = 0.05, 0.5  # share of a video, and seconds, that may be missing at its end
 STILL_PX = 0.05  # less motion than this between two small pictures is noise
 MIDDLE = 0.6  # share of its stretch of the way in which a frame is looked for
 
@@ -30,7 +32,31 @@ class Frame:
     upright_turn: int
 
 
-def pick_frames(path: Path, count: int) -> list[Frame]:
+@dataclass(frozen=True)
+class Picked:
+    """The frames chosen of a video, when its last picture was shown, and how long it says that it is.
+
+    `told` is 0 where the file does not say. Both in seconds.
+    """
+
+    frames: list[Frame]
+    shown: float
+    told: float
+
+    def said(self, path: Path) -> list[str]:
+        """A sentence when the pictures end well before the file says; none when all is there.
+
+        Of a copy that broke off some formats (Matroska, AVI) play what is there and tell no fault.
+        """
+        if self.told - self.shown <= max(SHORT_SECONDS, SHORT * self.told):
+            return []
+        return [
+            f"{path.name} says that it lasts {self.told:.1f} s, but its pictures end after "
+            f"{self.shown:.1f} s: was the copy cut short? the frames are of what is there"
+        ]
+
+
+def pick_frames(path: Path, count: int) -> Picked:
     """At most `count` frames of the video at `path`, in order: the sharpest of each stretch of motion.
 
     The way of the camera is the sum of the median optical flow between neighbouring frames; it is cut
@@ -38,7 +64,8 @@ def pick_frames(path: Path, count: int) -> list[Frame]:
     the variance of the Laplacian. One frame is held at a time. UserError when the file is no video or
     the camera never moves.
     """
-    frames, motion, sharpness = [], [], []
+    frames: list[Frame] = []
+    motion, sharpness = [], []
     last: np.ndarray | None = None
     for index, frame in enumerate(_decoded(path)):
         glance = _grey(frame, GLANCE_PX)
@@ -55,7 +82,8 @@ def pick_frames(path: Path, count: int) -> list[Frame]:
         raise UserError(
             f"{path}: the camera hardly moves.", "A scene needs a video from different places."
         )
-    return [frames[index] for index in choose(way, np.array(sharpness), count)]
+    chosen = choose(way, np.array(sharpness), count)
+    return Picked([frames[index] for index in chosen], frames[-1].seconds, _told_seconds(path))
 
 
 def choose(way: np.ndarray, sharpness: np.ndarray, count: int) -> list[int]:
@@ -89,13 +117,14 @@ def read_frames(path: Path, chosen: list[Frame]) -> Iterator[tuple[Frame, np.nda
 
 def save_frames(
     path: Path, folder: Path, count: int, longest_side: int, *, at_least: int = 1
-) -> list[ImageRecord]:
+) -> tuple[list[ImageRecord], list[str]]:
     """Writes at most `count` frames of the video into `folder`, no side above `longest_side` (0: any).
 
-    Returns their records: `source` tells the video and the time, the checksum is the video's.
-    UserError when there are fewer than `at_least`.
+    Returns their records (`source` tells the video and the time, the checksum is the video's) and what
+    the user should hear, as sentences. UserError when there are fewer than `at_least`.
     """
-    chosen, digest = pick_frames(path, count), file_sha256(path)
+    picked, digest = pick_frames(path, count), file_sha256(path)
+    chosen = picked.frames
     if len(chosen) < at_least:
         raise UserError(
             f"{path} shows only {len(chosen)} different places; a scene needs at least {at_least}.",
@@ -108,21 +137,37 @@ def save_frames(
         write_image(folder / name, resized(pixels, size))
         source = f"{path.name} at {frame.seconds:.3f} s"
         records.append(ImageRecord(name, source, digest, *size, None, "train", 0))
-    return records
+    return records, picked.said(path)
 
 
 def _decoded(path: Path) -> Iterator[av.VideoFrame]:
+    shown = None
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise UserError(f"{path} has no pictures, only sound.")
             container.streams.video[0].thread_type = "AUTO"
-            yield from container.decode(container.streams.video[0])
+            for frame in container.decode(container.streams.video[0]):
+                shown = float(frame.time or 0.0)
+                yield frame
     except av.FFmpegError as error:
-        raise UserError(
-            f"{path} is not a video that can be read ({error.strerror}).",
-            "Copy it again, or convert it to MP4.",
-        ) from None
+        told = f"{path} is not a video that can be read ({error.strerror})."
+        if shown is not None:
+            told = f"{path} is damaged after {shown:.1f} s ({error.strerror})."
+        raise UserError(told, "Copy it again, or convert it to MP4.") from None
+
+
+def _told_seconds(path: Path) -> float:
+    """How long the pictures of a video last by what the file says of them, else of all that it holds."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        if stream.duration and stream.time_base:
+            lasting = float(stream.duration * stream.time_base)  # of an AVI: guessed by its bytes
+            return max(lasting, float(stream.frames / (stream.average_rate or 1e9)))
+        tag = re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", ""))
+        if tag:  # Matroska's
+            return 3600 * float(tag[1]) + 60 * float(tag[2]) + float(tag[3])
+        return (container.duration or 0) / av.time_base
 
 
 def _grey(frame: av.VideoFrame, longest: int) -> np.ndarray:

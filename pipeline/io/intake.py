@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from pipeline.errors import UserError
 from pipeline.io.capture import Capture
 from pipeline.io.given import SAME_SHAPE, GivenView, Straightener, straightened
 from pipeline.io.images import turn
+from pipeline.io.lenses import lens_of
 from pipeline.io.masks import fit_mask, read_foreign_mask, read_rain_mask, write_keep_mask
 from pipeline.io.photos import Photo, Plan
 from pipeline.io.scene import ImageRecord
@@ -54,15 +56,21 @@ def straighteners(views: Mapping[str, GivenView]) -> dict[str, Straightener]:
 
 
 def photo_records(
-    capture: Capture, photos: Mapping[str, Photo], plan: Plan, size: tuple[int, int], folder: Path
+    capture: Capture,
+    photos: Mapping[str, Photo],
+    plan: Plan,
+    size: tuple[int, int],
+    folder: Path,
+    straighten: Mapping[str, Straightener],
 ) -> list[ImageRecord]:
     """The records, in name order, of the images (of `size`) that the photos in `folder` become."""
-    return [
-        photos[name].record(
-            name, capture.photos[name].relative_to(folder).as_posix(), plan.turns[name], size
-        )
-        for name in sorted(plan.turns)
-    ]
+    records = []
+    for name in sorted(plan.turns):
+        source = capture.photos[name].relative_to(folder).as_posix()
+        record = photos[name].record(name, source, plan.turns[name], size)
+        lens = lens_of(straighten[name]) if name in straighten else None
+        records.append(replace(record, lens=lens))
+    return records
 
 
 def given_views(

@@ -11,6 +11,18 @@ from pipeline.errors import UserError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 SHARED = ("images", "attention", "masks", "poses", "refine")
+# What lies in a scene's folder, where its variants have their own: none of them may bear such a name.
+TAKEN = (
+    *SHARED,
+    "nerf",
+    "views",
+    "metrics.json",
+    "metrics.csv",
+    "report",
+    "export",
+    "restored",
+    "small",
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +46,12 @@ class ScenePaths:
                     f"{name!r} cannot name a scene or a variant.",
                     "Use letters, digits, '.', '_' and '-', beginning with a letter or digit.",
                 )
+        if self.variant in TAKEN:
+            raise UserError(
+                f"a variant cannot be called {self.variant}: artifacts/{self.scene}/{self.variant} is "
+                "the scene's own.",
+                "Give it another name under variants: in params.yaml.",
+            )
         for name, place in self.folders.items():
             parts = place.split("/")
             if name not in SHARED or not all(NAME.fullmatch(part) for part in parts):
@@ -125,5 +143,5 @@ class ScenePaths:
 
     def work(self, stage: str) -> Path:
         """Scratch of a stage, outside what is cached: logs, checkpoints, databases."""
-        name = f"{self.scene}-{self.variant}" if self.variant else self.scene
-        return self.root / "artifacts" / ".work" / name / stage
+        own = self.root / "artifacts" / ".work" / self.scene
+        return own / "variants" / self.variant / stage if self.variant else own / stage

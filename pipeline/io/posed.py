@@ -38,12 +38,7 @@ def read_posed_images(
     Without a folder of `keep_masks` every pixel is kept. UserError when none has a pose, when a file is
     missing or damaged, or when the memory that is free cannot hold what a fit of them holds.
     """
-    records = [record for record in read_images_json(images) if record.name in views]
-    if not records:
-        raise UserError(
-            f"no photo in {images} has a pose.",
-            "Run `python -m stages.poses` again; poses/poses.json tells why photos were lost.",
-        )
+    records = posed_records(images, views)
     _refuse_too_large(records)
     found = []
     for record in records:
@@ -54,6 +49,26 @@ def read_posed_images(
             keep_mask = read_keep_mask(keep_masks / record.name, (view.width, view.height))
         found.append(PosedImage(record, view, rgb, keep_mask))
     return found
+
+
+def posed_records(
+    images: Path, views: Mapping[str, View], *, held_out_alone: bool = False
+) -> list[ImageRecord]:
+    """The images that have a pose, or the held-out ones among them, in name order; UserError for none."""
+    records = [record for record in read_images_json(images) if record.name in views]
+    if not records:
+        raise UserError(
+            f"no photo in {images} has a pose.",
+            "Run `python -m stages.poses` again; poses/poses.json tells why photos were lost.",
+        )
+    if held_out_alone:
+        records = [record for record in records if record.split == "test"]
+        if not records:
+            raise UserError(
+                f"no photo in {images} that has a pose is held out of the fit.",
+                "Set render.views: all, or hold photos out (ingest.holdout).",
+            )
+    return records
 
 
 def _refuse_too_large(records: Sequence[ImageRecord]) -> None:

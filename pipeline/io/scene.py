@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import read_json, write_json
@@ -20,12 +20,39 @@ RESERVED_STEMS = frozenset({"mean"})
 
 
 @dataclass(frozen=True)
+class Pinhole:
+    """Focal lengths and principal point in pixels, pixel (0, 0)'s centre at (0.5, 0.5)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens whose bending `ingest` took away from a photo: from `bent` to `straight`.
+
+    Both belong to pictures of `width` x `height`, turned as the image is. `distortion` holds OpenCV's
+    coefficients, of its fisheye model where `fisheye`.
+    """
+
+    width: int
+    height: int
+    bent: Pinhole
+    distortion: tuple[float, ...]
+    fisheye: bool
+    straight: Pinhole
+
+
+@dataclass(frozen=True)
 class ImageRecord:
     """One image of a scene.
 
     `name` is its file name in `images/`, `source` the photo's file name, `focal_px` the focal length from
     the photo's metadata at this size or None, `split` "train" or "test" (held out of the fit), `turned`
-    the degrees counter-clockwise by which the upright photo was turned so that all images have one size.
+    the degrees counter-clockwise by which the upright photo was turned so that all images have one size,
+    `lens` the lens that was straightened, None for pixels as they were taken.
     """
 
     name: str
@@ -36,6 +63,7 @@ class ImageRecord:
     focal_px: float | None
     split: Literal["train", "test"]
     turned: int
+    lens: Lens | None = None
 
     @property
     def stem(self) -> str:
@@ -76,33 +104,43 @@ def write_images_json(
 
 def read_origin(folder: Path) -> Origin:
     """Where a scene's images came from; UserError when `ingest` has not run or the list is damaged."""
-    content = read_json(folder / FILE, made_by="ingest")
-    try:
-        return Origin(**content.get("origin", {}))
-    except (AttributeError, TypeError) as error:
-        raise UserError(
-            f"{folder / FILE} is not a list of images ({error}).",
-            "Run `python -m stages.ingest` again.",
-        ) from None
+    return Origin(**_known(Origin, _read(folder).get("origin", {})))
 
 
 def read_images_json(folder: Path) -> list[ImageRecord]:
     """The images of a scene in name order; UserError when `ingest` has not run or the list is damaged."""
-    content = read_json(folder / FILE, made_by="ingest")
-    try:
-        records = [ImageRecord(**entry) for entry in content["images"]]
-        if not records:
-            raise ValueError("it names none")
-        if not all(isinstance(r.name, str) and Path(r.name).name == r.name for r in records):
-            raise ValueError("a name is none of a file")
-        if not all(isinstance(side, int) and side > 0 for r in records for side in r.size):
-            raise ValueError("a size is not in pixels")
-    except (KeyError, TypeError, ValueError) as error:
+    records = [_record(entry) for entry in _read(folder)["images"]]
+    problem = "" if records else "it names none"
+    for record in records:
+        if Path(record.name).name != record.name:
+            problem = f"{record.name!r} is no name of a file"
+        if min(record.size) <= 0:
+            problem = f"{record.name} has a size that is not in pixels"
+    if problem:
         raise UserError(
-            f"{folder / FILE} is not a list of images ({error}).",
+            f"{folder / FILE} is not a list of images ({problem}).",
             "Run `python -m stages.ingest` again.",
-        ) from None
+        )
     return sorted(records, key=lambda record: record.name)
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    shape = {"images": list[ImageRecord], "origin?": Origin}
+    return read_json(folder / FILE, "ingest", shape)
+
+
+def _record(entry: Mapping[str, Any]) -> ImageRecord:
+    values = _known(ImageRecord, entry)
+    if lens := values.get("lens"):
+        pinholes = {name: Pinhole(**_known(Pinhole, lens[name])) for name in ("bent", "straight")}
+        rest = {"distortion": tuple(lens["distortion"])}
+        values["lens"] = Lens(**{**_known(Lens, lens), **pinholes, **rest})
+    return ImageRecord(**values)
+
+
+def _known(kind: type, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """What of an entry `kind` has a field for."""
+    return {field.name: entry[field.name] for field in fields(kind) if field.name in entry}
 
 
 def with_split(records: Sequence[ImageRecord], every: int) -> list[ImageRecord]:

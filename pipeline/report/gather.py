@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import read_json
 from pipeline.io.images import read_image
 from pipeline.io.maps import read_depth, read_map
 from pipeline.io.masks import read_keep_mask
@@ -79,11 +78,6 @@ def coverage_heat(
     share = np.mean(masks, axis=0)
     largest = float(share.max())
     return data_uri(coloured(share / (largest or 1)), width, quality), largest
-
-
-def optional_json(path: Path) -> dict[str, Any]:
-    """The content of a JSON file, or an empty dict when it does not exist."""
-    return read_json(path) if path.is_file() else {}
 
 
 def _rows(path: Path, column: str, made_by: str) -> list[dict[str, str]]:

@@ -1,13 +1,20 @@
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.errors import UserError
 from pipeline.evaluation.references import find_references, read_reference
 from pipeline.io.images import write_image
-from pipeline.io.scene import ImageRecord
+from pipeline.io.scene import ImageRecord, read_images_json
+from pipeline.stage import Job
+from stages import ingest
 
 
 def record(width: int, height: int, turned: int = 0, name: str = "a.png") -> ImageRecord:
@@ -76,3 +83,40 @@ def test_a_reference_of_another_size_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.jpg"), picture(16, 12))
     with pytest.raises(UserError, match="16x12, its image is 6x8"):
         read_reference(tmp_path / "a.png", record(6, 8), tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"camera_model": "OPENCV_FISHEYE", "k1": 0.1},
+        {"k1": -0.3, "k2": 0.1},
+        {"k1": -0.3, "k2": 0.1, "turned": 6},
+    ],
+)
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_reference_is_straightened_as_its_photo_was(tmp_path: Path, lens, scale: int) -> None:
+    """The photo itself, taken for its reference, must come out as the image does."""
+    data, turned = tmp_path / "data/made", lens.get("turned", 1)
+    data.mkdir(parents=True)
+    exif = Image.Exif()
+    exif[0x0112] = turned
+    smooth = cv2.resize(picture(9, 7), (120, 90), interpolation=cv2.INTER_CUBIC)
+    frames = []
+    for number, name in enumerate("abc"):
+        Image.fromarray(smooth).save(data / f"{name}.png", exif=exif)
+        matrix = np.eye(4)
+        matrix[0, 3] = number
+        frames.append({"file_path": f"{name}.png", "transform_matrix": matrix.tolist()})
+    size = (120, 90) if turned == 1 else (90, 120)
+    numbers = {"w": size[0], "h": size[1], "fl_x": 70.0, "cx": 0.52 * size[0], **lens}
+    (data / "transforms.json").write_text(json.dumps({**numbers, "frames": frames}))
+    job = Job(tmp_path, "made", None, "cpu", None, False)
+    how = {"min_images": 3, "holdout": 2, "frames": 4, "mixed_sizes": "scale"}
+    ingest.main(job, ingest.Params(max_size=120 // scale, **how))
+    one = read_images_json(job.paths.images)[0]
+    assert one.lens is not None and one.turned == 0
+    image = cv2.imread(str(job.paths.images / "a.png"))[..., ::-1]
+    read = read_reference(data / "a.png", one, data / "a.png") * 255
+    assert np.abs(read - image).max() <= 0.51
+    bare = read_reference(data / "a.png", replace(one, lens=None), data / "a.png") * 255
+    assert np.abs(bare - image).mean() > 3, "the lens matters here"

@@ -34,7 +34,7 @@ def test_labels_come_from_places():
 
 def test_the_command(tmp_path, capsys):
     path = tmp_path / "artifacts" / "demo" / "metrics.json"
-    write_json(path, MASKED)
+    write_json(path, MASKED | {"conventions": {"mask_threshold": 0.05}})
     assert main([str(path)]) == 0
     assert "28.46" in capsys.readouterr().out
     assert main([str(path.with_name("none.json"))]) == 2

@@ -99,30 +99,100 @@ def test_no_pose_at_all(whole: Workshop) -> None:
     whole.refuses("nerf", "pose")
 
 
-@pytest.mark.parametrize("stage", ["refine", "nerf", "export"])
+@pytest.mark.parametrize("stage", ["refine", "nerf", "render", "export"])
 def test_poses_of_other_photos(whole: Workshop, stage: str) -> None:
     path = whole.artifacts / "poses/transforms.json"
     path.write_text(path.read_text().replace("view_", "window_"))
     whole.refuses(stage, "no photo in", "has a pose", "python -m stages.poses` again")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda content: content.update(images=[]),
-        lambda content: content["images"][0].update(name=3),
-        lambda content: content["images"][0].update(name="../view_0.png"),
-        lambda content: content["images"][0].update(width="240"),
-        lambda content: content["images"][0].update(height=0),
-        lambda content: content["images"][0].pop("turned"),
-    ],
-)
-def test_a_list_of_images_that_is_none(whole: Workshop, change: Callable[[Any], Any]) -> None:
-    path = whole.artifacts / "images/images.json"
+def test_no_held_out_photo_to_render(whole: Workshop) -> None:
+    def fit_all(content: Any) -> None:
+        for entry in content["images"]:
+            entry["split"] = "train"
+
+    _changed(whole.artifacts / "images/images.json", fit_all)
+    whole.set("render", views="test")
+    whole.refuses("render", "is held out of the fit", "render.views: all")
+
+
+def _changed(path: Path, change: Callable[[Any], Any]) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
-    whole.refuses("attention", "images.json is not a list of images", "stages.ingest` again")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda content: content.update(images=[]), "it names none"),
+        (lambda content: content.update(images={}), "images should be a list"),
+        (lambda content: content["images"][0].update(name=3), "images[0].name should be text"),
+        (lambda content: content["images"][0].update(name="../view_0.png"), "no name of a file"),
+        (lambda content: content["images"][0].update(width="240"), "should be a whole number"),
+        (lambda content: content["images"][0].update(height=0), "a size that is not in pixels"),
+        (lambda content: content["images"][0].pop("turned"), "images[0].turned is missing"),
+        (lambda content: content["images"][0].update(focal_px="wide"), "images[0].focal_px"),
+        (lambda content: content["images"][0].update(split="both"), "train or test"),
+    ],
+)
+def test_a_list_of_images_that_is_none(
+    whole: Workshop, change: Callable[[Any], Any], told: str
+) -> None:
+    _changed(whole.artifacts / "images/images.json", change)
+    whole.refuses("attention", "images.json is", told, "stages.ingest` again")
+
+
+@pytest.mark.parametrize(
+    ("stage", "name", "change", "told"),
+    [
+        (
+            "report",
+            "images/images.json",
+            lambda all: all["origin"].update(said="no"),
+            "origin.said",
+        ),
+        ("report", "metrics.json", lambda all: all.update(test=None), "test should be"),
+        ("report", "metrics.json", lambda all: all["test"].update(psnr="29"), "test.psnr"),
+        ("report", "metrics.json", lambda all: all["test"].update(lpips_reason=[]), "lpips_reason"),
+        ("report", "metrics.json", lambda all: all["poses"].pop("total"), "poses.total is missing"),
+        ("report", "metrics.json", lambda all: all.update(rounds={"0": 1}), "rounds.0"),
+        ("report", "metrics.json", lambda all: all.pop("conventions"), "conventions is missing"),
+        ("report", "poses/poses.json", lambda all: all.update(registered=5), "registered"),
+        (
+            "report",
+            "poses/poses.json",
+            lambda all: all.update(lost=[{"name": "a"}]),
+            "lost[0].reason",
+        ),
+        ("report", "poses/poses.json", lambda all: all.update(tried=["x", "y"]), "tried[0]"),
+        (
+            "report",
+            "poses/poses.json",
+            lambda all: all.update(reprojection_px="0"),
+            "reprojection_px",
+        ),
+        ("report", "masks/masks.json", lambda all: all.update(threshold={}), "threshold"),
+        ("report", "refine/refine.json", lambda all: all.update(rounds=["x"]), "rounds"),
+        ("report", "refine/refine.json", lambda all: all.update(rounds={"x": {}}), "rounds.x"),
+        ("report", "refine/refine.json", lambda all: all.update(rounds={"0": {}}), "0.coverage"),
+        ("report", "views/seen.json", lambda all: all.update({"view_0.png": 1}), "view_0.png"),
+        (
+            "refine",
+            "masks/masks.json",
+            lambda all: all.update(mode=["given"]),
+            "mode should be text",
+        ),
+    ],
+)
+def test_values_of_the_wrong_kind_inside(
+    whole: Workshop, stage: str, name: str, change: Callable[[Any], Any], told: str
+) -> None:
+    path = whole.artifacts / name
+    made_by = {"images": "ingest", "metrics": "evaluate", "seen": "render"}
+    _changed(path, change)
+    again = f"python -m stages.{made_by.get(path.stem, path.stem)}` again"
+    whole.refuses(stage, f"{name} is damaged: ", told, again)
 
 
 @pytest.mark.parametrize(

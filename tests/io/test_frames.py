@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -39,7 +41,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_frames_are_sharp_and_spread_over_the_way_not_over_time(video: Path) -> None:
     places, _ = _pan()
-    chosen = pick_frames(video, 6)
+    chosen = pick_frames(video, 6).frames
     assert [frame.index % 2 for frame in chosen] == [0] * 6, "the blurred ones are odd"
     where = np.array([places[frame.index] for frame in chosen])
     assert (np.diff(where) > 40).all() and (np.diff(where) < 160).all()
@@ -59,7 +61,7 @@ def test_a_phone_held_upright_gives_upright_frames(video: Path, tmp_path: Path) 
     place = data.index(bytes.fromhex(UPRIGHT), data.index(b"tkhd"))
     turned = tmp_path / "turned.mp4"
     turned.write_bytes(data[:place] + bytes.fromhex(QUARTER) + data[place + 36 :])
-    frame, pixels = next(read_frames(turned, pick_frames(turned, 3)))
+    frame, pixels = next(read_frames(turned, pick_frames(turned, 3).frames))
     # The matrix takes x (right) to y (down): a quarter clockwise.
     expected = np.rot90(_pan()[1][frame.index], -1) * 255
     assert pixels.shape == expected.shape
@@ -67,7 +69,8 @@ def test_a_phone_held_upright_gives_upright_frames(video: Path, tmp_path: Path) 
 
 
 def test_saved_frames_are_numbered_and_tell_their_time(video: Path, tmp_path: Path) -> None:
-    records = save_frames(video, tmp_path, 5, 160)
+    records, said = save_frames(video, tmp_path, 5, 160)
+    assert said == []
     assert [record.name for record in records] == [f"frame_{i:04d}.png" for i in range(5)]
     assert {image_size(tmp_path / record.name) for record in records} == {(160, 120)}
     assert records[0].source.startswith("pan.mp4 at ")
@@ -87,3 +90,37 @@ def test_what_is_no_video_and_what_does_not_move_is_refused(tmp_path: Path) -> N
     write_video(tmp_path / "still.mp4", [_pan()[1][0]] * 12, 24)
     with pytest.raises(UserError, match=r"still\.mp4: the camera hardly moves"):
         pick_frames(tmp_path / "still.mp4", 5)
+
+
+@pytest.mark.parametrize("kind", ["mkv", "webm", "avi"])
+def test_a_copy_that_broke_off_is_told(tmp_path: Path, kind: str) -> None:
+    """These formats play what is there and tell no fault: two thirds of 3.75 s here."""
+    whole = tmp_path / f"whole.{kind}"
+    with av.open(str(whole), "w") as container:
+        codec = {"mkv": "libx264", "webm": "libvpx", "avi": "mpeg4"}[kind]
+        stream = container.add_stream(codec, rate=24)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for frame in _pan()[1]:
+            pixels = np.ascontiguousarray((255 * frame).astype(np.uint8))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode(None))
+    assert pick_frames(whole, 5).said(whole) == []
+    cut = tmp_path / f"cut.{kind}"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    (said,) = pick_frames(cut, 5).said(cut)
+    assert said.startswith(f"cut.{kind} says that it lasts ") and "cut short" in said
+
+
+def test_an_mp4_that_broke_off_is_told_or_refused_with_the_second(
+    video: Path, tmp_path: Path
+) -> None:
+    """Decoders differ in whether the picture at the break is a fault to them."""
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(video.read_bytes()[: video.stat().st_size * 2 // 3])
+    try:
+        (said,) = pick_frames(cut, 5).said(cut)
+    except UserError as error:
+        said = error.what
+    assert re.search(
+        r"cut\.mp4 is damaged after [1-3]\.\d s|its pictures end after [1-3]\.\d s", said
+    )
