@@ -87,8 +87,10 @@ def wen_loss(
     loss = 25 * F.mse_loss(full, target) + 25 * F.mse_loss(full * wet, target * wet)
     loss = loss + 50 * F.mse_loss(found.quarter, target[..., ::4, ::4])
     loss = loss + 25 * F.mse_loss(found.half, target[..., ::2, ::2])
-    clear = found.clear.flatten(0, 1).clamp(1e-6, 1 - 1e-6)
-    loss = loss + (5 if single else 10) * F.binary_cross_entropy(clear, 1 - wet)
+    clear = found.clear.float().flatten(0, 1).clamp(1e-6, 1 - 1e-6)  # 1 - 1e-6 is 1 in bfloat16
+    with torch.autocast(clear.device.type, enabled=False):  # a GPU's autocast refuses this one
+        map_loss = F.binary_cross_entropy(clear, 1 - wet.float())
+    loss = loss + (5 if single else 10) * map_loss
     if perceptual is not None:
         loss = loss + 10 * perceptual(full, target)
         if single:

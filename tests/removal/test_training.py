@@ -101,6 +101,27 @@ def test_losses_are_zero_at_the_truth() -> None:
     assert float(wen_loss(truth._replace(clear=drops), clean, clean, drops)) > 100
 
 
+def test_the_map_of_wen_is_judged_in_full_precision_outside_autocast(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A GPU's autocast region refuses this cross-entropy; a CPU's does not, so a spy refuses it here."""
+    real, dtypes = F.binary_cross_entropy, []
+
+    def refuses(found: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+        assert not torch.is_autocast_enabled(found.device.type)
+        dtypes.extend([found.dtype, wanted.dtype])
+        return real(found, wanted)
+
+    made = recipe("wen")
+    batch = draw_batch([pictures(5)], np.random.default_rng(0), 1, 32)
+    monkeypatch.setattr(F, "binary_cross_entropy", refuses)
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = made.train().outcome(batch, None).loss
+        assert torch.is_autocast_enabled("cpu")
+    assert dtypes == [torch.float32] * 2 and loss.dtype == torch.float32
+    assert bool(torch.isfinite(loss))
+
+
 def test_what_is_added_to_the_published_losses_is_added() -> None:
     """Squares of what is off, guides that know nothing yet, and the mended photo, worked out."""
     batch = draw_batch([pictures()], np.random.default_rng(0), 2, 32)
