@@ -78,7 +78,7 @@ def _found(job: Job, params: Params, records: Sequence[ImageRecord]) -> sfm.Reco
     """Poses and points from the photos, or the poses that came with them and points for these."""
     paths, names = job.paths, [record.name for record in records]
     masks, given = paths.masks if params.use_masks else None, paths.images / GIVEN_POSES
-    with tqdm(unit="photo", leave=False) as bar:
+    with tqdm(total=len(names), desc="features", unit="photo", leave=False) as bar:
         common: dict[str, Any] = {
             "work_dir": paths.work("poses"),
             "settings": _settings(params, read_origin(paths.images).kind, len(records)),

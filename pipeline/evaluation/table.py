@@ -22,6 +22,8 @@ COLUMNS = (
     ("SSIM", "composite.ssim", "{:.3f}"),
     ("photo PSNR", "input.psnr", "{:.2f}"),
     ("mask IoU", "masks.iou", "{:.3f}"),
+    ("to photos", "selfcheck.kept_psnr", "{:.2f}"),
+    ("masked", "masks.coverage", "{:.1%}"),
 )
 MISSING = "-"
 
@@ -44,11 +46,18 @@ def reasons(metrics: Mapping[str, Any]) -> dict[str, str]:
 
 
 def table(fits: Mapping[str, Mapping[str, Any]]) -> str:
-    """An aligned Markdown table, one row per fit by label, then why numbers are missing."""
-    rows = [["fit", *(heading for heading, _, _ in COLUMNS), "poses"]]
+    """An aligned Markdown table, one row per fit by label, then why numbers are missing.
+
+    Columns that no fit has a number for are left out; "to photos" is the PSNR of held-out views to the
+    photos beside the drops.
+    """
+    columns = [
+        one for one in COLUMNS if any(look_up(fit, one[1]) is not None for fit in fits.values())
+    ]
+    rows = [["fit", *(heading for heading, _, _ in columns), "poses"]]
     for label, metrics in fits.items():
         rows.append(
-            [label, *(_cell(metrics, name, form) for _, name, form in COLUMNS), _poses(metrics)]
+            [label, *(_cell(metrics, name, form) for _, name, form in columns), _poses(metrics)]
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = [_line(row, widths) for row in rows]

@@ -57,11 +57,13 @@ def value(metrics: Mapping[str, Any], name: str) -> float | None:
 
 
 def table(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> list[Line]:
-    """The lines of the table; `other` are the numbers of the fit to compare with."""
+    """The lines of the table, where there is a number; `other` are those of the fit to compare with."""
     lines = []
     for group, label, name, form, rising in ROWS:
         own = value(metrics, name)
         theirs = value(other, name) if other else None
+        if own is None and theirs is None:
+            continue
         gain, ahead = "", None
         if own is not None and theirs is not None and rising is not None and own != theirs:
             gain = f"{own - theirs:+{form}}"
@@ -72,13 +74,17 @@ def table(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> list[L
 
 
 def missing(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Dotted names that have no number, gathered by their reason: (reason, names)."""
-    by_reason: dict[str, list[str]] = {}
-    for group, numbers in sorted(metrics.items()):
-        for leaf, text in sorted(numbers.items()) if isinstance(numbers, Mapping) else ():
-            if leaf.endswith("_reason"):
-                by_reason.setdefault(text, []).append(f"{group}.{leaf.removesuffix('_reason')}")
-    return [(reason, ", ".join(names)) for reason, names in by_reason.items()]
+    """What of the table has no number, gathered by its reason: (reason, labels under their groups)."""
+    by_reason: dict[str, dict[str, list[str]]] = {}
+    for group, label, name, _, _ in ROWS:
+        place, leaf = name.split(".")
+        if reason := metrics.get(place, {}).get(f"{leaf}_reason", ""):
+            plain = label.removesuffix(", dB").removesuffix(", °")
+            by_reason.setdefault(reason, {}).setdefault(group, []).append(plain)
+    return [
+        (reason, "; ".join(f"{group}: {', '.join(labels)}" for group, labels in groups.items()))
+        for reason, groups in by_reason.items()
+    ]
 
 
 def unmet(scene: str, variant: str) -> list[tuple[str, str]]:

@@ -16,7 +16,7 @@ UNMASKED = {"test": {"psnr": 22.0, "ssim": 0.8}, "poses": {"registered": 24, "to
 def test_rows_align_and_gaps_are_explained():
     lines = table({"demo": MASKED, "demo unmasked": UNMASKED}).splitlines()
     assert len({len(line) for line in lines[:4]}) == 1
-    assert lines[2].startswith("| demo          |     28.46 | 0.910 |     - |")
+    assert lines[2].startswith("| demo          |     28.46 | 0.910 |    0.850 |")
     assert lines[4] == "- test.lpips: no weights"
 
 

@@ -25,7 +25,14 @@ def test_the_table_says_who_is_ahead():
 
 
 def test_what_is_missing_is_listed_by_reason():
-    assert missing(OWN) == [("no weights", "test.lpips")]
+    assert missing(OWN) == [("no weights", "Held-out views: LPIPS")]
+
+
+def test_without_references_the_table_has_no_empty_lines():
+    reasons = {"psnr": None, "psnr_reason": "no truth"}
+    blind = {"test": reasons, "input": reasons, "selfcheck": {"kept_psnr": 24.0}}
+    assert [line.label for line in table(blind, None)] == ["PSNR to the photo beside them, dB"]
+    assert missing(blind) == [("no truth", "Held-out views: PSNR; Photos as taken: PSNR")]
 
 
 def test_headline_and_tiles_tell_gain_and_loss_alike():
