@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from torch.nn import functional as F
 
 from pipeline.errors import UserError
 from pipeline.evaluation.image import as_batch
+from pipeline.io.weights import fill, read_state
 
 NET = "AlexNet, LPIPS v0.1"
 # The convolutions of torchvision's AlexNet `features`, by their place in it:
@@ -27,17 +27,16 @@ _LAYERS = {
 _POOLED_BEFORE = (3, 6)
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-# What reading a wrong file as weights can raise.
-_UNFIT = (
-    pickle.UnpicklingError,
-    RuntimeError,
-    EOFError,
-    LookupError,
-    TypeError,
-    ValueError,
-    OSError,
-)
 SMALLEST_SIDE = 31  # below it the second pooling has nothing to pool
+
+
+class AlexNet(nn.ModuleDict):
+    """Its convolutions, by their place."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            {str(place): nn.Conv2d(i, o, k, s, p) for place, (i, o, k, s, p) in _LAYERS.items()}
+        )
 
 
 class Lpips(nn.Module):
@@ -52,9 +51,7 @@ class Lpips(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.features = nn.ModuleDict(
-            {str(place): nn.Conv2d(i, o, k, s, p) for place, (i, o, k, s, p) in _LAYERS.items()}
-        )
+        self.features = AlexNet()
         self.heads = nn.ParameterList(
             [torch.zeros(1, layer[1], 1, 1) for layer in _LAYERS.values()]
         )
@@ -87,17 +84,9 @@ def load_lpips(backbone: Path) -> Lpips:
     unsafe to read, or of another network.
     """
     hint = "Set evaluate.lpips_backbone to torchvision's alexnet-owt-*.pth, or to null."
-    if not backbone.is_file():
-        raise UserError(f"the LPIPS backbone {backbone} does not exist.", hint)
     model = Lpips()
-    try:
-        state = torch.load(backbone, map_location="cpu", weights_only=True)
-        wanted = model.features.state_dict()
-        model.features.load_state_dict({name: state[f"features.{name}"] for name in wanted})
-    except _UNFIT as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
-        raise UserError(f"{backbone} does not hold AlexNet weights ({reason}).", hint) from None
-    heads = torch.load(_heads_file(), map_location="cpu", weights_only=True)
+    fill(model.features, read_state(backbone, hint), str(backbone), "features.{}".format, hint)
+    heads = read_state(_heads_file())
     for layer, head in enumerate(model.heads):
         head.data.copy_(heads[f"lin{layer}.model.1.weight"])
     return model.eval().requires_grad_(False)

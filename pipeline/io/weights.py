@@ -31,7 +31,7 @@ def read_state(path: Path, hint: str = "") -> dict[str, Tensor]:
     elif path.suffix == ".npz":
         state = _read_npz(path, hint)
     else:
-        state = _read_torch(path)
+        state = _read_torch(path, hint)
     named = {name.removeprefix("module."): value for name, value in state.items()}
     return {
         name: torch.as_tensor(value)
@@ -48,14 +48,14 @@ def _read_npz(path: Path, hint: str) -> Mapping[str, Any]:
         raise UserError(f"{path} is not an npz file of plain arrays ({error}).", hint) from None
 
 
-def _read_torch(path: Path) -> Mapping[str, Any]:
+def _read_torch(path: Path, hint: str) -> Mapping[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # what a damaged pickle raises has no common kind
         told = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
         raise UserError(
             f"{path} is not a PyTorch file that can be read without running code from it ({told}).",
-            "Where you trust it, convert it with safetensors.torch.save_file.",
+            f"{hint} Where you trust it, convert it with safetensors.torch.save_file.".strip(),
         ) from None
     for wrapper in WRAPPERS:
         if isinstance(state, Mapping) and isinstance(state.get(wrapper), Mapping):
@@ -63,7 +63,7 @@ def _read_torch(path: Path) -> Mapping[str, Any]:
     if not isinstance(state, Mapping):
         raise UserError(
             f"{path} holds a {type(state).__name__}, not a state dict.",
-            "Save network.state_dict(), not the network.",
+            f"{hint} Save network.state_dict(), not the network.".strip(),
         )
     return state
 
@@ -73,6 +73,7 @@ def fill(
     state: Mapping[str, Tensor],
     origin: str,
     rename: Callable[[str], str] = str,
+    hint: str = "",
 ) -> None:
     """Loads `state` into `network` and leaves it in evaluation mode; tensors not asked for are passed over.
 
@@ -94,7 +95,8 @@ def fill(
         more = f"; and {len(problems) - 8} more" if len(problems) > 8 else ""
         raise UserError(
             f"{origin} does not hold the weights of {type(network).__name__}: "
-            f"{'; '.join(problems[:8])}{more}."
+            f"{'; '.join(problems[:8])}{more}.",
+            hint,
         )
     network.load_state_dict(taken)
     network.eval()
