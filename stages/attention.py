@@ -28,6 +28,7 @@ class Params(Section):
     weights: Annotated[str, Field(min_length=1)]
     steps: Annotated[int, Field(ge=1, le=16)]
     scales: Annotated[list[Annotated[float, Field(gt=0, le=4)]], Field(min_length=1, max_length=8)]
+    mirrored: bool
     tile: Annotated[int, Field(ge=32, le=8192)]
 
 
@@ -76,6 +77,7 @@ def attributes_of(params: Params, digest: str) -> dict[str, str | float]:
         "derainnerf:weights_sha256": digest,
         "derainnerf:steps": str(params.steps),
         "derainnerf:scales": " ".join(f"{scale:g}" for scale in params.scales),
+        **({"derainnerf:mirrored": "true"} if params.mirrored else {}),
     }
 
 
@@ -94,7 +96,7 @@ def attend_image(
     found = np.zeros(pixels.shape[:2], np.float32)
     if params.model != "none":
         network = _network(weights, params.model, digest, device)
-        found = attend(network, pixels, scales=params.scales, tile=params.tile, steps=params.steps)
+        found = attend(network, pixels, **params.model_dump(exclude={"model", "weights"}))
     write_map(out, found, attributes)
     return float((found > 0.3).mean())
 

@@ -6,8 +6,9 @@
 
 A scene is a folder with photos and truth/coverage/, as the stage synthesize makes it; it is scored
 per view, by equation 5 (view or mean map) and by the mean map alone. A pixel is wet where the true
-coverage is above 0.05; in a photo pair (N_rain.png, N_clean.png), where any channel differs by more
-than 30 of 255 once the photos are shifted to match. All pixels of a set are counted together.
+coverage is above 0.05, and for paintings and renders a second time where the water changes a
+channel by more than 30 of 255; in a photo pair (N_rain.png, N_clean.png), where any channel differs
+by more than that once the photos are shifted to match. All pixels of a set are counted together.
 Pairs are scored a second time without the pixels that differ by 10 to 30: water that lies before its
 own colour, or edges that no shift brings together. There the difference cannot tell.
 """
@@ -15,7 +16,7 @@ own colour, or edges that no shift brings together. There the difference cannot 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +27,7 @@ import torch
 from pipeline.attention.inference import attend
 from pipeline.attention.pools import (
     CHUNK,
+    aimed,
     list_pictures,
     paint_chunk,
     painted_name,
@@ -92,9 +94,11 @@ def painted_cases(folder: Path, scratch: Path, count: int, difference: bool) -> 
         yield f"{k:02d}", _unit(rainy), wet
 
 
-def rendered_cases(folder: Path) -> Iterator[Case]:
-    """Pictures of a folder with rainy/, clean/ and coverage/."""
-    for k, (rainy, _, cover) in enumerate(zip(*read_rendered(folder), strict=True)):
+def rendered_cases(folder: Path, difference: bool) -> Iterator[Case]:
+    """Pictures of a folder with rainy/, clean/ and coverage/; wet as for painted ones."""
+    pictures = read_rendered(folder)
+    aims = aimed(pictures, "difference" if difference else "coverage")[2]
+    for k, (rainy, cover) in enumerate(zip(pictures[0], aims, strict=True)):
         yield f"{k:02d}", _unit(rainy), cover / 255 > VISIBLE_COVERAGE
 
 
@@ -145,10 +149,12 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, help="folder of renders never trained on")
     parser.add_argument("--dry", nargs="*", type=Path, default=[], help="folders of dry photos")
     parser.add_argument("--scales", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--mirrored", action="store_true", help="averaged with the mirror image's")
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--scratch", type=Path, default=Path("artifacts/.work/demo/train_detector"))
     flags = parser.parse_args()
-    print(f"threshold {flags.threshold:g}, scales {flags.scales}")
+    with_mirror = ", mirrored" * flags.mirrored
+    print(f"threshold {flags.threshold:g}, scales {flags.scales}{with_mirror}")
     for detector in flags.detectors:
         print(f"\n{detector}\n{'set':40s}    P     R    F1   IoU | best    at    AP")
         network = named_detector(detector)
@@ -165,7 +171,15 @@ def main() -> None:
 
 
 def _mapped(network: Detector, photo: np.ndarray, flags: argparse.Namespace) -> np.ndarray:
-    return attend(network, photo, scales=flags.scales, steps=flags.steps)
+    return attend(network, photo, scales=flags.scales, steps=flags.steps, mirrored=flags.mirrored)
+
+
+def tallied(mapped: Callable[[np.ndarray], np.ndarray], cases: Iterable[Case]) -> Tally:
+    """The pixels of all cases, each mapped by itself."""
+    tally = Tally()
+    for _, photo, wet in cases:
+        tally.add(mapped(photo), wet)
+    return tally
 
 
 def dry_shares(network: Detector, folder: Path, flags: argparse.Namespace) -> dict[str, float]:
@@ -192,17 +206,14 @@ def tallies(network: Detector, flags: argparse.Namespace) -> Iterator[tuple[str,
             for (_, _, wet), found in zip(cases, values, strict=True):
                 tally.add(found, wet)
             yield f"{scene.name}, {kind} ({len(cases)})", tally
-    if flags.painted:
-        for difference in (False, True):
-            tally = Tally()
-            for _, photo, wet in painted_cases(flags.painted, flags.scratch, 40, difference):
-                tally.add(mapped(photo), wet)
-            yield f"painted, {'difference > 30' if difference else 'coverage > 0.05'}", tally
-    if flags.rendered:
-        tally = Tally()
-        for _, photo, wet in rendered_cases(flags.rendered):
-            tally.add(mapped(photo), wet)
-        yield f"{flags.rendered.name}, per view", tally
+    for difference in (False, True):
+        truth = "difference > 30" if difference else "coverage > 0.05"
+        if flags.painted:
+            painted = painted_cases(flags.painted, flags.scratch, 40, difference)
+            yield f"painted, {truth}", tallied(mapped, painted)
+        if flags.rendered:
+            found = tallied(mapped, rendered_cases(flags.rendered, difference))
+            yield f"{flags.rendered.name}, {truth}", found
     if flags.pairs:
         together, surely = Tally(), Tally()
         for name, photo, wet, sure in pair_cases(flags.pairs):

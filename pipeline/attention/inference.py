@@ -22,6 +22,7 @@ def attend(
     scales: Sequence[float] = (1.0,),
     tile: int = 512,
     steps: int = STEPS,
+    mirrored: bool = False,
 ) -> np.ndarray:
     """Where drops are on a photo: (H,W) float32 in [0,1], 1 = a drop.
 
@@ -30,6 +31,8 @@ def attend(
     network sees: the same map as in one piece, about (tile + 2*reach)^2 pixels at a time, where
     reach is 13 per step for the attentive network and 144 for the U-Net.
     scales: factors of the image's size; the maps, brought back to that size, are averaged.
+    mirrored: each of these maps is the mean of the photo's and of its mirror image's (left for right),
+    which is as likely a photo; upside down it is not, since drops turn what stands behind them over.
     """
     if not scales or min(scales) <= 0 or tile < 1 or steps < 1:
         raise ValueError(f"scales {scales}, tile {tile} and steps {steps} must be positive")
@@ -37,7 +40,10 @@ def attend(
     total = np.zeros((height, width), np.float32)
     for scale in scales:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        found = _attend_once(network, _resized(image, size), tile, steps)
+        scaled = _resized(image, size)
+        found = _attend_once(network, scaled, tile, steps)
+        if mirrored:
+            found = (found + _attend_once(network, scaled[:, ::-1], tile, steps)[:, ::-1]) / 2
         total += _resized(found, (width, height))
     return np.clip(total / np.float32(len(scales)), 0.0, 1.0)
 

@@ -52,6 +52,18 @@ def test_the_map_is_that_of_the_bgr_picture_clamped(network: AttentiveRecurrentN
     assert not np.allclose(attend(network, image[..., ::-1]), raw, atol=1e-3)
 
 
+def test_with_its_mirror_image_left_and_right_are_told_alike(
+    network: AttentiveRecurrentNet,
+) -> None:
+    image = _image(40, 56)
+    turned = np.ascontiguousarray(image[:, ::-1])
+    one, other = (attend(network, each, steps=1) for each in (image, turned))
+    assert not np.allclose(one, other[:, ::-1], atol=1e-3)
+    both = [attend(network, each, steps=1, mirrored=True) for each in (image, turned)]
+    assert np.array_equal(both[0], both[1][:, ::-1])
+    assert np.allclose(both[0], (one + other[:, ::-1]) / 2, atol=1e-6)
+
+
 def test_scales_are_averaged(network: AttentiveRecurrentNet) -> None:
     image = _image(32, 40)
     one, half = (attend(network, image, scales=(scale,), steps=1) for scale in (1.0, 0.5))

@@ -20,7 +20,9 @@ from pipeline.stage import Job, run
 from stages.attention import Params, attend_image, attributes_of, main
 
 SIZES = (37, 53)
-PARAMS = Params(model="unet", weights="w/unet.safetensors", steps=2, scales=[1.0, 0.5], tile=32)
+PARAMS = Params(
+    model="unet", weights="w/unet.safetensors", steps=2, scales=[1.0, 0.5], mirrored=False, tile=32
+)
 ATTENTIVE = PARAMS.model_copy(update={"model": "attentive", "weights": "w/attentive.safetensors"})
 
 
@@ -50,7 +52,12 @@ def _digests(root: Path) -> dict[str, str]:
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize("params", [PARAMS, ATTENTIVE], ids=lambda params: params.model)
+MIRRORED = PARAMS.model_copy(update={"mirrored": True})
+
+
+@pytest.mark.parametrize(
+    "params", [PARAMS, ATTENTIVE, MIRRORED], ids=["unet", "attentive", "mirrored"]
+)
 def test_a_map_per_image_and_their_mean(root: Path, params: Params) -> None:
     closing = main(_job(root), params)
     folder = root / "artifacts/made/attention"
