@@ -56,8 +56,13 @@ def photos_and_field(
     settings: dict[str, Any],
     views: int = VIEWS,
     size: tuple[int, int] = SIZE,
+    device: str = "cpu",
+    half: bool | None = None,
 ) -> tuple[list[PosedPhoto], list[PosedPhoto], GridField | PaperField]:
-    """Photos to fit, photos held out, and a fresh field with params.yaml's settings."""
+    """Photos to fit, photos held out, and a fresh field with params.yaml's settings on ``device``.
+
+    ``half``: products in bfloat16; None where that is faster.
+    """
     focal = FOCAL * size[0] / SIZE[0]
     camera_numbers = (focal, focal, size[0] / 2, size[1] / 2, 0.0)
     photos = []
@@ -69,12 +74,12 @@ def photos_and_field(
     cams = np.stack([photo.cam_from_world for photo in photos])
     numbers, sizes = np.tile(camera_numbers, (views, 1)), np.tile(size, (views, 1))
     space = scene_space("ndc", cams, numbers, sizes, NEAR, FAR)
-    config = {}
+    config: dict[str, Any] = {}
     if model == "fast":
         same = ("samples", "levels", "features", "table_log2", "distortion", "decay")
         config = {k: settings[k] for k in same} | grid_sizes(space, settings["resolution"])
-        config["half"] = half_is_fast()
-    field = build(model, config, space, settings["seed"])
+    config["half"] = half_is_fast(model, device) if half is None else half
+    field = build(model, config, space, settings["seed"]).to(device)
     return [p for i, p in enumerate(photos) if i % 8], photos[::8], field
 
 

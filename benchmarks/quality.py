@@ -189,7 +189,7 @@ def measure(
             PosedPhoto(stem, image, keep_mask, view.cam_from_world, view.intrinsics, near, far)
         )
     config = {key: settings[key] for key in FIELD}
-    field = build_around("fast", list(views.values()), near, far, **config).to(device)
+    field = build_around("fast", list(views.values()), near, far, device=device, **config)
     buffer = RayBuffer(photos, settings["seed"], device)
     clock = time.process_time if device == "cpu" else time.perf_counter
     begin = clock()

@@ -113,8 +113,6 @@ def gather(
     With a ``sink`` the table's gradient is not formed: the rows to add go into the list, under
     ``name``, so that a fit can add up several batches at once, one table per thread.
     """
-    if torch.compiler.is_compiling():  # the compiler makes one loop of all this, both ways
-        return (table[rows] * weights[..., None]).sum(1)
     return _Gather.apply(table, rows, weights, name, sink)
 
 
@@ -143,8 +141,6 @@ def pick(
     table: Tensor, rows: Tensor, name: str = "", sink: list[RowGradient] | None = None
 ) -> Tensor:
     """``table[rows]`` of a table ``(size, 1)``, in the shape of ``rows``; ``sink`` as for gather."""
-    if torch.compiler.is_compiling():
-        return table.view(-1)[rows]
     return _Pick.apply(table, rows, name, sink)
 
 

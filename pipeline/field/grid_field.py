@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -82,7 +81,6 @@ class GridField(nn.Module):
     """
 
     plain = False
-    compiled: Callable[..., tuple[Tensor, Tensor]] | None = None
 
     def __init__(self, config: GridConfig, space: Space, seed: int) -> None:
         super().__init__()
@@ -116,28 +114,6 @@ class GridField(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """See :class:`pipeline.field.base.Field`."""
         phase, noise = self.phase(step), self._noise(rays, generator)
-        if self.compiled is not None:
-            return self.compiled(self, rays, observed, drop_mask, phase, noise, None, gain)
-        return self._losses(rays, observed, drop_mask, phase, noise, sink, gain)
-
-    def phase(self, step: int) -> Phase:
-        """See :class:`pipeline.field.base.Field`."""
-        return Phase(step < 200 or step % 2 == 0, self.config.trim > 0.0 and step >= 200)
-
-    def samples_per_ray(self) -> int:
-        """See :class:`pipeline.field.base.Field`."""
-        return self.config.samples
-
-    def _losses(
-        self,
-        rays: Rays,
-        observed: Tensor,
-        drop_mask: Tensor,
-        phase: Phase,
-        noise: Noise,
-        sink: list[RowGradient] | None,
-        gain: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
         with torch.set_grad_enabled(phase.learn_proposal):
             proposed = self._propose(rays, noise, sink)
         out = self._shade(rays, proposed.detach(), noise, sink)
@@ -152,6 +128,14 @@ class GridField(nn.Module):
         if self.config.distortion > 0.0:
             total = total + self.config.distortion * distortion_loss(out.edges, out.weights)
         return total, photometric
+
+    def phase(self, step: int) -> Phase:
+        """See :class:`pipeline.field.base.Field`."""
+        return Phase(step < 200 or step % 2 == 0, self.config.trim > 0.0 and step >= 200)
+
+    def samples_per_ray(self) -> int:
+        """See :class:`pipeline.field.base.Field`."""
+        return self.config.samples
 
     def _noise(self, rays: Rays, generator: torch.Generator) -> Noise:
         count, bins, near = rays.near.shape[0], self.config.bins, rays.near

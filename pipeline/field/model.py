@@ -85,10 +85,16 @@ def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:
     }
 
 
-def half_is_fast(device: str = "cpu") -> bool:
-    """Whether this processor, or GPU, multiplies bfloat16 numbers by itself, several times faster."""
+def half_is_fast(model: str, device: str) -> bool:
+    """Whether products of bfloat16 numbers make steps of ``model`` faster on ``device``.
+
+    The fast field's where the processor multiplies them by itself; on a GPU products are the least of
+    its step, and converting costs more. The paper's, all products, on a GPU alone.
+    """
+    if model == "paper":
+        return device != "cpu" and torch.cuda.get_device_capability(device) >= (8, 0)
     if device != "cpu":
-        return torch.cuda.get_device_capability(device) >= (8, 0)
+        return False
     features = get_host_cpu_features()
     return bool(features.get("avx512bf16") or features.get("amx-bf16"))
 
@@ -117,8 +123,8 @@ def build_around(
     """A fresh field around what ``cameras`` see between the depths ``near`` and ``far``.
 
     ``space`` as in :func:`scene_space`; ``resolution`` vertices of the fast field's finest grid
-    along the longer side; ``precision`` of the products is float32, bfloat16 or auto: the latter
-    where ``device``, on which the field lies, is fast at it (the paper's on a GPU alone). ``config``
+    along the longer side; ``precision`` of the products is float32, bfloat16 (the paper's on a
+    GPU alone) or auto: :func:`half_is_fast` on ``device``, on which the field lies. ``config``
     overrides fields of GridConfig (the paper's has none here); samples and bins are raised to what a
     contracted space needs.
     """
@@ -126,7 +132,7 @@ def build_around(
     intrinsics = np.array([camera.intrinsics for camera in cameras])
     sizes = np.array([(camera.width, camera.height) for camera in cameras])
     around = scene_space(space, cams, intrinsics, sizes, near, far)
-    half = half_is_fast(device) if precision == "auto" else precision == "bfloat16"
+    half = half_is_fast(model, device) if precision == "auto" else precision == "bfloat16"
     if model == "paper":
         half = half and device != "cpu"
         return build("paper", {"half": half}, around, seed).to(device)

@@ -16,7 +16,7 @@ from pipeline.field.base import Part
 from pipeline.field.buffer import Batch, PosedPhoto, RayBuffer
 from pipeline.field.fit import Stepper, fit
 from pipeline.field.grid_field import GridConfig, GridField
-from pipeline.field.model import build_around, describe, restore, scene_space
+from pipeline.field.model import build_around, describe, half_is_fast, restore, scene_space
 from pipeline.field.render import render_view
 from pipeline.field.store import Checkpoint
 
@@ -232,6 +232,11 @@ def test_products_are_of_the_precision_asked_for(
     assert model.config.half is half
     record = fit(model, RayBuffer(photos, 0), steps=30, batch_rays=256, seed=0, log_every=10)
     assert record.rows[-1][2] > record.rows[0][2] + 0.5
+
+
+def test_half_precision_is_for_where_products_are_what_takes_time() -> None:
+    assert not half_is_fast("fast", "cuda")
+    assert not half_is_fast("paper", "cpu")
 
 
 def test_cameras_all_around_get_as_fine_a_grid_and_more_samples() -> None:
