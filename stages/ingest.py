@@ -75,6 +75,7 @@ def _from_photos(
     )  # fmt: skip
     turns = intake.given_turns(photos, capture.views)
     plan = plan_sizes(photos, mixed=params.mixed_sizes, fixed_turns=turns)
+    intake.enough(plan, photos, params.min_images)
     size = final_size(plan.size, params.max_size)
     straighten = intake.straighteners(capture.views)
     map_named(

@@ -10,17 +10,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from pipeline.attention.lures import CLIPPED, GAMMA
-from pipeline.attention.samples import SEEN_DIFFERENCE, UNSEEN_WEIGHT, ZOOM, Pool
-from pipeline.geometry.crops import Stack, draw_crops, stacked
-
-
-def resident(pools: Sequence[Pool], device: str) -> list[Stack]:
-    """The pools on the device; channels: rainy, clean, coverage. Every picture needs its clean one."""
-    return [
-        stack
-        for pool in pools
-        for stack in stacked([pool.rainy, pool.clean, pool.coverage], pool.share, device)
-    ]
+from pipeline.attention.samples import SEEN_DIFFERENCE, UNSEEN_WEIGHT, ZOOM
+from pipeline.geometry.crops import Stack, draw_crops
 
 
 def draw_resident(

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pipeline.attention.lures import lure
+from pipeline.geometry.crops import window_side
 
 # Any pixel with more water than this counts as a drop: faintly wet pixels spoil a fit as well.
 VISIBLE_COVERAGE = 0.05
@@ -94,7 +95,7 @@ def _draw(
     index = int(rng.integers(len(pool.rainy)))
     dry = len(pool.clean) > 0 and rng.random() < clean_share
     cover = pool.coverage[index]
-    size = min(_window(rng, crop), *cover.shape)
+    size = min(window_side(rng, crop, ZOOM), *cover.shape)
     places = [(_offset(rng, cover.shape[0], size), _offset(rng, cover.shape[1], size))]
     if rng.random() < 0.5:  # half of the crops: the wetter one of two places
         places.append((_offset(rng, cover.shape[0], size), _offset(rng, cover.shape[1], size)))
@@ -130,13 +131,6 @@ def visibility(rainy: np.ndarray, clean: np.ndarray, coverage: np.ndarray) -> np
     change = cv2.blur(np.abs(rainy - clean).max(axis=2), (5, 5))
     unseen = (coverage > 0) & (change < SEEN_DIFFERENCE)
     return np.where(unseen, np.float32(UNSEEN_WEIGHT), np.float32(1))
-
-
-def _window(rng: np.random.Generator, crop: int) -> int:
-    """How many pixels a crop takes from the picture: half of them at another scale."""
-    if rng.random() < 0.5:
-        return crop
-    return round(crop * float(np.exp(rng.uniform(*np.log(ZOOM)))))
 
 
 def _offset(rng: np.random.Generator, length: int, size: int) -> int:

@@ -15,10 +15,11 @@ from torch.nn import functional as F
 
 from pipeline.attention.muon import Muon
 from pipeline.attention.network import AttentiveRecurrentNet
-from pipeline.attention.resident import draw_resident, resident
+from pipeline.attention.resident import draw_resident
 from pipeline.attention.samples import VISIBLE_COVERAGE, Pool, draw_batch, wetness
 from pipeline.attention.unet import DropUNet
 from pipeline.attention.weights import Detector
+from pipeline.geometry.crops import resident
 
 THETA = 0.8
 # Columns of the validation curve; see `curve_rows`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,6 +12,19 @@ from torch import Tensor
 from torch.nn import functional as F
 
 WET_GRID = 16  # points per side at which the water of a window is looked up
+
+
+class WetPictures(Protocol):
+    """Rainy pictures, the same without drops, and their water, for crops drawn with a share."""
+
+    @property
+    def rainy(self) -> Sequence[np.ndarray]: ...
+    @property
+    def clean(self) -> Sequence[np.ndarray]: ...
+    @property
+    def coverage(self) -> Sequence[np.ndarray]: ...
+    @property
+    def share(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -22,6 +36,22 @@ class Stack:
 
     pixels: Tensor
     share: float
+
+
+def window_side(rng: np.random.Generator, crop: int, zoom: tuple[float, float]) -> int:
+    """How many pixels a crop takes from its picture: half of them at another scale, within `zoom`."""
+    if rng.random() < 0.5:
+        return crop
+    return round(crop * float(np.exp(rng.uniform(*np.log(zoom)))))
+
+
+def resident(pools: Sequence[WetPictures], device: str) -> list[Stack]:
+    """The pools on the device; channels: rainy, clean, coverage. Every picture needs its clean one."""
+    return [
+        stack
+        for pool in pools
+        for stack in stacked([pool.rainy, pool.clean, pool.coverage], pool.share, device)
+    ]
 
 
 def stacked(parts: Sequence[Sequence[np.ndarray]], share: float, device: str) -> list[Stack]:

@@ -180,6 +180,8 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
         with publish_dir(data) as fresh:
             shutil.copyfile(source, fresh / source.name)
         return
+    if not source.exists():
+        raise UserError(f"{source} does not exist.", "Look for a slip of the pen in --from.")
     if not source.is_dir():
         raise UserError(f"{source} is no folder and no video.", "Name the folder of your photos.")
     capture = find_capture(source, at_least, read_colmap)

@@ -21,6 +21,16 @@ from pipeline.io.transforms import View
 SUSPECT = 0.6  # a set of masks that drops more than this is likely upside down
 
 
+def enough(plan: Plan, photos: Mapping[str, Photo], at_least: int) -> Plan:
+    """`plan` itself; UserError when it uses fewer than `at_least` of the photos."""
+    if len(plan.turns) < at_least:
+        raise UserError(
+            f"{len(plan.turns)} of {len(photos)} photos can be used: {'; '.join(plan.said)}.",
+            f"A scene needs at least {at_least} photos of one shape, taken from different places.",
+        )
+    return plan
+
+
 def given_turns(
     photos: Mapping[str, Photo], views: Mapping[str, GivenView]
 ) -> dict[str, int] | None:

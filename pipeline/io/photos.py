@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -91,7 +92,8 @@ def _below(folder: Path) -> str:
     """Where else the photos may be meant to be, as a hint: only the top level is searched."""
     for below in sorted(path for path in folder.iterdir() if path.is_dir()):
         if any(path.suffix.lower() in PHOTO_SUFFIXES for path in below.iterdir()):
-            return f"Subfolders are not searched: move the photos up, or name {below} with --from."
+            name = shlex.quote(str(below))
+            return f"Subfolders are not searched: move the photos up, or name {name} with --from."
     return ""
 
 
@@ -162,8 +164,21 @@ def plan_sizes(
     that still differ are scaled to the smallest where their shapes agree; otherwise the photos of the
     most common shape are used and the others left out, as long as they are half of all. UserError when
     they are not, or when sizes differ and `mixed` is "refuse". `fixed_turns` leaves no choice of turns:
-    poses that came with the photos hold for one orientation.
+    poses that came with the photos hold for one orientation. Of photos that are copies of one file the
+    first is used: held out, it would be judged against its own twin.
     """
+    originals: dict[str, str] = {}
+    for name in sorted(photos):
+        originals.setdefault(photos[name].sha256, name)
+    copies = sorted(photos.keys() - originals.values())
+    if copies and fixed_turns is None:
+        rest = {name: photo for name, photo in photos.items() if name not in copies}
+        plan = plan_sizes(rest, mixed=mixed)
+        said = (
+            f"{len(copies)} of {len(photos)} photos are copies of others, byte for byte, and are left "
+            f"out: {', '.join(Path(name).stem for name in copies)}"
+        )
+        return replace(plan, left_out=sorted([*plan.left_out, *copies]), said=[said, *plan.said])
     choices = [dict(fixed_turns)] if fixed_turns is not None else _choices_of_turns(photos)
     for turns in choices:
         sizes = {photo.size_after(turns[name]) for name, photo in photos.items()}

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.geometry.crops import Stack, draw_crops, stacked
+from pipeline.geometry.crops import Stack, draw_crops, window_side
 
 # |rainy - clean| beyond this is a drop, in Qian et al. (CVPR 2018) as for all who use their pairs.
 DIFFERENCE = 30 / 255
@@ -71,15 +71,6 @@ def draw_batch(pools: Sequence[Pairs], rng: np.random.Generator, batch: int, cro
     return Batch(rainy, clean, drop_map(rainy, clean))
 
 
-def resident(pools: Sequence[Pairs], device: str) -> list[Stack]:
-    """The pools on the device; channels: the rainy frames, the clean ones, coverage."""
-    return [
-        stack
-        for pool in pools
-        for stack in stacked([pool.rainy, pool.clean, pool.coverage], pool.share, device)
-    ]
-
-
 def draw_resident(
     stacks: Sequence[Stack], rng: np.random.Generator, batch: int, crop: int
 ) -> Batch:
@@ -97,7 +88,7 @@ def draw_resident(
 def _draw(
     rainy: np.ndarray, clean: np.ndarray, cover: np.ndarray, rng: np.random.Generator, crop: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    size = min(_window(rng, crop), *cover.shape)
+    size = min(window_side(rng, crop, ZOOM), *cover.shape)
     # Of two places the wetter one: most of a picture is dry, and there is little to learn there.
     places = [tuple(int(rng.integers(n - size + 1)) for n in cover.shape) for _ in range(2)]
     wet = [int(cover[y : y + size : 4, x : x + size : 4].sum()) for y, x in places]
@@ -115,10 +106,3 @@ def _draw(
         pair = pair * np.exp(rng.normal(0, 0.1) + rng.normal(0, 0.04, 3))
     both = np.clip(pair, 0, 1).astype(np.float32)
     return both[0], both[1]
-
-
-def _window(rng: np.random.Generator, crop: int) -> int:
-    """How many pixels a crop takes from the picture: half of them at another scale."""
-    if rng.random() < 0.5:
-        return crop
-    return round(crop * float(np.exp(rng.uniform(*np.log(ZOOM)))))

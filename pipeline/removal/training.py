@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.errors import UserError
+from pipeline.geometry.crops import resident
 from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop, critic_of
-from pipeline.removal.samples import Batch, Pairs, draw_batch, draw_resident, resident
+from pipeline.removal.samples import Batch, Pairs, draw_batch, draw_resident
 
 # Columns of the validation curve; see `curve_rows`.
 CURVE = ("iteration", "loss", "set", "psnr_rainy", "psnr")

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from pipeline.attention import lures, pools, samples
-from pipeline.attention.resident import defocused, draw_resident, lure, resident, visibility
+from pipeline.attention.resident import defocused, draw_resident, lure, visibility
 from pipeline.attention.samples import Pool
 from pipeline.attention.training import Phase, Trainer
 from pipeline.attention.unet import DropUNet
+from pipeline.geometry.crops import resident
 
 
 def _pool(size: int = 64) -> Pool:

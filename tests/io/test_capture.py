@@ -366,6 +366,8 @@ def test_adopting_what_cannot_be_used_leaves_nothing(tmp_path: Path) -> None:
     _write(source, content)
     with pytest.raises(UserError, match="lies outside"):
         adopt(source, data, 3, _no_colmap)
-    with pytest.raises(UserError, match="no folder and no video"):
+    with pytest.raises(UserError, match="nothing does not exist"):
         adopt(tmp_path / "nothing", data, 3, _no_colmap)
+    with pytest.raises(UserError, match="no folder and no video"):
+        adopt(source / "transforms.json", data, 3, _no_colmap)
     assert not data.exists()

@@ -39,6 +39,7 @@ def _photo(path: Path, size: tuple[int, int] = (40, 30), orientation: int = 1) -
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif[ORIENTATION] = orientation
+    exif[0x010E] = path.stem  # a description: no two photos are the same file
     pixels = np.full((size[1], size[0], 3), 90, np.uint8)
     pixels[: size[1] // 2, : size[0] // 2] = 250  # the stored top left quarter is bright
     Image.fromarray(pixels).save(path, quality=95, exif=exif)
@@ -172,7 +173,7 @@ def test_one_command_brings_a_folder_in(tmp_path: Path) -> None:
     assert again.returncode == 2 and "exists already" in again.stderr
     assert (root / "params.yaml").read_text() == after
     bad = _from(root, "shed", tmp_path / "nowhere")
-    assert bad.returncode == 2 and "no folder and no video" in bad.stderr
+    assert bad.returncode == 2 and "nowhere does not exist" in bad.stderr
     assert (root / "params.yaml").read_text() == after and not (root / "data/shed").exists()
 
 

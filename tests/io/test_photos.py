@@ -9,6 +9,7 @@ from PIL import Image
 
 from pipeline.errors import UserError
 from pipeline.io.images import can_read, image_size, read_photo, turn
+from pipeline.io.intake import enough
 from pipeline.io.photos import (
     Photo,
     convert,
@@ -33,6 +34,7 @@ def _photo(
     pixels[:8, -8:] = (0, 250, 0)
     exif = Image.Exif()
     exif[ORIENTATION] = orientation
+    exif[0x010E] = path.stem  # a description: no two photos are the same file
     if focal:
         exif.get_ifd(EXIF_IFD)[FOCAL_35MM] = focal
     Image.fromarray(pixels).save(path, quality=95, exif=exif)
@@ -211,3 +213,28 @@ def test_raw_files_name_the_remedy(tmp_path: Path) -> None:
         list_photos(tmp_path, 1)
     _photo(tmp_path / "a.JPG")
     assert list(list_photos(tmp_path, 1)) == ["a.png", "b.png"], "cameras can store both"
+
+
+def _named(sha256: str, size: tuple[int, int] = (40, 30)) -> Photo:
+    return Photo(*size, 0, None, sha256)
+
+
+def test_copies_of_a_photo_are_left_out() -> None:
+    """Phones and cloud folders make `IMG_1 (1).jpg`: held out, it would be judged against itself."""
+    photos = {f"{name}.png": _named(name[0]) for name in ("a", "b", "a_(1)", "c")}
+    plan = plan_sizes(photos)
+    assert sorted(plan.turns) == ["a.png", "b.png", "c.png"] and plan.left_out == ["a_(1).png"]
+    assert plan.said == [
+        "1 of 4 photos are copies of others, byte for byte, and are left out: a_(1)"
+    ]
+    given = plan_sizes(photos, fixed_turns=dict.fromkeys(photos, 0))
+    assert len(given.turns) == 4, "a pose holds for each"
+
+
+def test_what_is_left_must_still_be_a_scene() -> None:
+    photos = {f"{i}.png": _named("a") for i in range(6)}
+    with pytest.raises(UserError, match=r"1 of 6 photos can be used: 5 of 6 photos are copies"):
+        enough(plan_sizes(photos), photos, 3)
+    mixed = {f"{i}.png": _named(str(i), (40, 30) if i < 2 else (30, 30)) for i in range(4)}
+    with pytest.raises(UserError, match=r"2 of 4 photos can be used: 2 of 4 .* another shape"):
+        enough(plan_sizes(mixed), mixed, 3)

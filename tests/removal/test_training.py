@@ -13,13 +13,14 @@ from torch.nn import functional as F
 from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.attention.training import attention_loss
 from pipeline.errors import UserError
+from pipeline.geometry.crops import resident
 from pipeline.io.tensors import save_tensors
 from pipeline.removal import clips
 from pipeline.removal.autoencoder import Scales, multi_scale_loss
 from pipeline.removal.critics import AttentiveCritic, PatchCritic, Verdict
 from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, wen_loss
 from pipeline.removal.recipes import Added, AnyRecipe, recipe_of, weights_of
-from pipeline.removal.samples import Pairs, draw_batch, draw_resident, drop_map, resident
+from pipeline.removal.samples import Pairs, draw_batch, draw_resident, drop_map
 from pipeline.removal.training import Phase, Plan, Trainer, fit
 from pipeline.removal.wen import Frames, mend
 
