@@ -28,8 +28,10 @@ from pipeline.attention.unet import DropUNet
 from pipeline.attention.weights import load_network
 from pipeline.errors import UserError
 from pipeline.io.images import write_image
+from pipeline.io.tensors import load_tensors
 
-SHIPPED = Path(__file__).parents[2] / "weights" / "detector.safetensors"
+WEIGHTS = Path(__file__).parents[2] / "weights"
+SHIPPED = {"detector": "attentive", "unet": "unet", "unet-difference": "unet"}
 
 
 def _pool(count: int = 6, size: int = 64) -> Pool:
@@ -215,7 +217,8 @@ def test_folders_of_pairs(tmp_path: Path) -> None:
         read_rendered(tmp_path / "empty")
 
 
-def test_shipped_weights_find_a_painted_drop() -> None:
+def _bricks_and_a_drop() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A wall without and with a drop before it (96,96,3) in [0,1], and the drop's coverage."""
     from pipeline.drops.painter import paint
     from pipeline.drops.shape import Drop
 
@@ -227,10 +230,32 @@ def test_shipped_weights_find_a_painted_drop() -> None:
     picture = bricks * (0.5 + 0.5 * x / 96)[..., None]
     drop = Drop(center=(6.0, -4.0), radius=9.0, contact_angle=1.1)
     wet, coverage = paint(picture, [drop], focal_px=333, pane_distance=333, aperture_radius=2.5)
-    network = load_network(SHIPPED)
+    return picture, wet, coverage
+
+
+@pytest.mark.parametrize(("file", "model"), SHIPPED.items())
+def test_shipped_weights_find_a_painted_drop(file: str, model: str) -> None:
+    picture, wet, coverage = _bricks_and_a_drop()
+    path = WEIGHTS / f"{file}.safetensors"
+    assert load_tensors(path)[1].get("model", "attentive") == model
+    network = load_network(path, model)
     found = attend(network, wet)
     core, away = coverage > 0.5, coverage == 0
     assert core.sum() > 200
     assert found[core].mean() > 0.4
     assert found[away].mean() < 0.1
     assert attend(network, picture)[core].mean() < 0.1
+
+
+def test_the_shipped_weights_for_differences_mark_what_differs_and_less_of_the_rim() -> None:
+    picture, wet, coverage = _bricks_and_a_drop()
+    differs = (
+        coverage_of_pair(*(np.rint(each * 255).astype(np.uint8) for each in (wet, picture))) > 0
+    )
+    faint = (coverage > 0) & ~differs
+    found = [
+        attend(load_network(WEIGHTS / f"{name}.safetensors", "unet"), wet)
+        for name in ("unet", "unet-difference")
+    ]
+    assert differs.sum() > 100 and found[1][differs].mean() > 0.8
+    assert found[1][faint].mean() < found[0][faint].mean() - 0.05
