@@ -83,9 +83,9 @@ def main(job: Job, params: Params) -> str:
         write_drop_masks(fresh, names, done.rounds[-1].drop_masks)
         told = account(done, names)
         write_json(fresh / "refine.json", told)
-    return (
-        f"{len(done.rounds) - 1} rounds, {100 * told['mean_coverage']:.1f} % masked, {told['why']}"
-    )
+    count = len(done.rounds) - 1
+    rounds = "1 round" if count == 1 else f"{count} rounds"
+    return f"{rounds}, {100 * told['mean_coverage']:.1f} % masked, {told['why']}"
 
 
 def _look(

@@ -157,7 +157,7 @@ def restore(
         space = Space.from_json(description["space"])
         field = build(description["model"], description["config"], space, 0)
         field.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in tensors.items()})
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise UserError(
             f"The fitted field cannot be read back: {reason}.",

@@ -16,7 +16,7 @@ ROWS: tuple[tuple[str, str, str, str, bool | None], ...] = (
     ("Held-out views", "PSNR beside the drops, dB", "kept.psnr", ".2f", True),
     (
         "Held-out views",
-        "PSNR to the photo beside them, dB",
+        "PSNR to the photo, beside the drops, dB",
         "selfcheck.kept_psnr",
         ".2f",
         True,

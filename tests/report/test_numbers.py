@@ -31,7 +31,9 @@ def test_what_is_missing_is_listed_by_reason():
 def test_without_references_the_table_has_no_empty_lines():
     reasons = {"psnr": None, "psnr_reason": "no truth"}
     blind = {"test": reasons, "input": reasons, "selfcheck": {"kept_psnr": 24.0}}
-    assert [line.label for line in table(blind, None)] == ["PSNR to the photo beside them, dB"]
+    assert [line.label for line in table(blind, None)] == [
+        "PSNR to the photo, beside the drops, dB"
+    ]
     assert missing(blind) == [("no truth", "Held-out views: PSNR; Photos as taken: PSNR")]
 
 
