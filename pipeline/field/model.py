@@ -20,6 +20,8 @@ from pipeline.geometry.spaces import Space, fit_space
 CONTRACTED_FINER = 4
 CONTRACTED_SAMPLES = 32
 CONTRACTED_BINS = 64
+# Most of its table's rows are met by few rays: what these leave there should fade sooner.
+CONTRACTED_DECAY = 3.0
 
 
 class Camera(Protocol):
@@ -126,7 +128,7 @@ def build_around(
     along the longer side; ``precision`` of the products is float32, bfloat16 (the paper's on a
     GPU alone) or auto: :func:`half_is_fast` on ``device``, on which the field lies. ``config``
     overrides fields of GridConfig (the paper's has none here); samples and bins are raised to what a
-    contracted space needs.
+    contracted space needs, and its ``decay`` is a multiple of what is given.
     """
     cams = np.stack([camera.cam_from_world for camera in cameras])
     intrinsics = np.array([camera.intrinsics for camera in cameras])
@@ -140,6 +142,7 @@ def build_around(
     if around.kind == "contract":
         config["samples"] = max(config.get("samples", GridConfig.samples), CONTRACTED_SAMPLES)
         config["bins"] = max(config.get("bins", GridConfig.bins), CONTRACTED_BINS)
+        config["decay"] = CONTRACTED_DECAY * config.get("decay", GridConfig.decay)
     return build("fast", config, around, seed).to(device)
 
 

@@ -251,9 +251,12 @@ def test_cameras_all_around_get_as_fine_a_grid_and_more_samples() -> None:
             )
 
     cameras = [Camera(angle) for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
-    model = build_around("fast", cameras, 2.0, 1e6, resolution=768, samples=16, table_log2=10)
+    config = {"samples": 16, "table_log2": 10, "decay": 0.1}
+    model = build_around("fast", cameras, 2.0, 1e6, resolution=768, **config)
     assert isinstance(model, GridField)
     assert model.space.kind == "contract"
+    assert model.config.decay > 0.1
+    assert build_around("fast", cameras, 2.0, 1e6, table_log2=10, decay=0.0).config.decay == 0.0
     assert model.config.samples == 32
     assert model.config.bins == 64
     # A pixel is 4/350 wide where they look; the unit ball reaches to the cameras.
