@@ -72,10 +72,11 @@ def main() -> None:
     """Prints one line per scene."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path, nargs="+")
+    scenes = parser.parse_args().data
     print(
         "| scene | views | water (> 0.5) | never clean | in fewer than 3 views |\n|---|---|---|---|---|"
     )
-    for data in parser.parse_args().data:
+    for data in scenes:
         depth, alpha, poses, k = read(data)
         seen = clean_counts(depth, alpha, poses, k)
         dry = clean_counts(depth, np.zeros_like(alpha), poses, k)
