@@ -175,8 +175,8 @@ def plan_sizes(
         rest = {name: photo for name, photo in photos.items() if name not in copies}
         plan = plan_sizes(rest, mixed=mixed)
         said = (
-            f"{len(copies)} of {len(photos)} photos are copies of others, byte for byte, and are left "
-            f"out: {', '.join(Path(name).stem for name in copies)}"
+            f"left out as copies of other photos, byte for byte ({len(copies)} of {len(photos)}): "
+            f"{', '.join(Path(name).stem for name in copies)}"
         )
         return replace(plan, left_out=sorted([*plan.left_out, *copies]), said=[said, *plan.said])
     choices = [dict(fixed_turns)] if fixed_turns is not None else _choices_of_turns(photos)

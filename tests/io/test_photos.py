@@ -224,16 +224,14 @@ def test_copies_of_a_photo_are_left_out() -> None:
     photos = {f"{name}.png": _named(name[0]) for name in ("a", "b", "a_(1)", "c")}
     plan = plan_sizes(photos)
     assert sorted(plan.turns) == ["a.png", "b.png", "c.png"] and plan.left_out == ["a_(1).png"]
-    assert plan.said == [
-        "1 of 4 photos are copies of others, byte for byte, and are left out: a_(1)"
-    ]
+    assert plan.said == ["left out as copies of other photos, byte for byte (1 of 4): a_(1)"]
     given = plan_sizes(photos, fixed_turns=dict.fromkeys(photos, 0))
     assert len(given.turns) == 4, "a pose holds for each"
 
 
 def test_what_is_left_must_still_be_a_scene() -> None:
     photos = {f"{i}.png": _named("a") for i in range(6)}
-    with pytest.raises(UserError, match=r"1 of 6 photos can be used: 5 of 6 photos are copies"):
+    with pytest.raises(UserError, match=r"1 of 6 photos can be used: left out as copies"):
         enough(plan_sizes(photos), photos, 3)
     mixed = {f"{i}.png": _named(str(i), (40, 30) if i < 2 else (30, 30)) for i in range(4)}
     with pytest.raises(UserError, match=r"2 of 4 photos can be used: 2 of 4 .* another shape"):
