@@ -195,8 +195,7 @@ def measure(
     begin = clock()
     fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
         seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
-        average=settings["average"],
-        shards=2 if device == "cpu" else 1, threads=threads)  # fmt: skip
+        average=settings["average"], threads=threads)  # fmt: skip
     seconds = clock() - begin
     torch.set_num_threads(threads)
     renders = {}
