@@ -4,7 +4,8 @@
 
 One line per scene: precision, recall and IoU, over all views, of what `refine` starts from when every view is
 mapped by the detector, against the true coverage (> 0.05). Images, masks and poses are those in
-artifacts/<scene>, the same for all detectors, so that only the maps differ.
+artifacts/<scene>, the same for all detectors, so that only the maps differ. `--mirrored` maps each view twice,
+as the stage does by default.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from pipeline.masking.loop import repair
 from stages.refine import BEYOND
 
 
-def gathered(network: Detector, paths: ScenePaths) -> tuple[str, MaskScores]:
+def gathered(network: Detector, paths: ScenePaths, mirrored: bool) -> tuple[str, MaskScores]:
     """Which glass the maps tell, and how good the masks gathered on it are."""
     views = read_transforms(paths.poses / "transforms.json")
     images = read_posed_images(paths.images, paths.masks, views)
@@ -39,7 +40,7 @@ def gathered(network: Detector, paths: ScenePaths) -> tuple[str, MaskScores]:
     near = min(view.near for view in views.values())
     done = repair(
         lambda drop_masks, found: [],  # without rounds nothing is looked at
-        [attend(network, np.asarray(image.rgb, np.float32)) for image in images],
+        [attend(network, np.asarray(image.rgb, np.float32), mirrored=mirrored) for image in images],
         [
             GlassCamera(i.view.cam_from_world, i.view.intrinsics, i.view.width, i.view.height)
             for i in images
@@ -64,12 +65,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("detector", help="MODEL:FILE")
     parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--mirrored", action="store_true", help="averaged with the mirror image's")
     parser.add_argument("--root", type=Path, default=Path(), help="folder of data/ and artifacts/")
     flags = parser.parse_args()
     network = named_detector(flags.detector)
     print(f"{flags.detector}\n{'scene':14s} glass     P     R   IoU")
     for scene in flags.scenes:
-        mode, scores = gathered(network, ScenePaths(flags.root.resolve(), scene))
+        mode, scores = gathered(network, ScenePaths(flags.root.resolve(), scene), flags.mirrored)
         figures = f"{scores.precision:.3f} {scores.recall:.3f} {scores.iou:.4f}"
         print(f"{scene:14s} {mode:5s} {figures}", flush=True)
 
