@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 import types
 from collections.abc import Iterable, Mapping
@@ -36,11 +37,9 @@ def misfit(content: Any, shape: Shape, where: str = "") -> str:
     elif origin in (list, tuple) and isinstance(content, list):
         return _first((value, inside[0], f"{where}[{i}]") for i, value in enumerate(content))
     elif origin is dict and isinstance(content, dict):
-        odd = (
-            "" if inside[0] is str else next((name for name in content if not name.isdecimal()), "")
-        )
+        odd = [] if inside[0] is str else [name for name in content if not name.isdecimal()]
         parts = ((value, inside[1], _at(where, name)) for name, value in content.items())
-        return f"{_at(where, odd)} should have a number for a name" if odd else _first(parts)
+        return f"{_at(where, odd[0])} should have a number for a name" if odd else _first(parts)
     elif named and isinstance(content, dict):
         return _members(content, shape, where)
     else:
@@ -58,7 +57,12 @@ def _members(content: dict[str, Any], shape: Shape, where: str) -> str:
 
 
 def _kinds(shape: Shape) -> Mapping[str, Any]:
-    return shape if isinstance(shape, Mapping) else get_type_hints(shape)
+    return shape if isinstance(shape, Mapping) else _hints(shape)
+
+
+@functools.cache  # evaluating annotations costs more than all else, and lists hold hundreds of one kind
+def _hints(shape: type) -> Mapping[str, Any]:
+    return get_type_hints(shape)
 
 
 def _needed(shape: Shape) -> list[str]:
@@ -85,6 +89,7 @@ def _first(parts: Iterable[tuple[Any, Any, str]]) -> str:
 
 
 def _at(where: str, name: str) -> str:
+    name = name or '""'
     return f"{where}.{name}" if where else name
 
 

@@ -46,6 +46,7 @@ def test_what_fits(content: Any, shape: Any) -> None:
         ({}, list[str], "it should be a list"),
         ({"a": [1, "2"]}, dict[str, list[int]], "a[1] should be a whole number"),
         ({"first": 1.0}, dict[int, float], "first should have a number for a name"),
+        ({"": 1.0}, dict[int, float], '"" should have a number for a name'),
         ("a", Photo, "it should be names with values"),
         ({"images": [GOOD, {"name": "b"}]}, {"images": list[Photo]}, "images[1].focal is missing"),
         (GOOD | {"focal": "wide"}, Photo, "focal should be a number or null"),
