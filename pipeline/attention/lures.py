@@ -19,7 +19,7 @@ def lure(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return overexposed(image, float(np.exp(rng.uniform(np.log(1.3), np.log(3.0)))))
     radius = float(np.exp(rng.uniform(np.log(1.5), np.log(12.0))))
     if kind < 0.4:
-        return defocused(_at_night(image, rng), radius)
+        return defocused(at_night(image, rng), radius)
     blurred = defocused(image, radius)
     if rng.random() < 0.4:
         return blurred
@@ -48,14 +48,14 @@ def defocused(image: np.ndarray, radius: float) -> np.ndarray:
     return np.power(np.clip(spread, 0, 1), 1 / GAMMA).astype(np.float32)
 
 
-def _at_night(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The picture darkened, with small lights in a few colours."""
+def at_night(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The picture (H,W,3) in [0,1] darkened, with small lights in a few colours."""
     dark = image * np.float32(rng.uniform(0.15, 0.5))
     height, width = image.shape[:2]
     for _ in range(int(rng.integers(4, 30))):
         centre = (int(rng.integers(width)), int(rng.integers(height)))
         colour = np.clip(rng.uniform(0.5, 1.6) * (1 + rng.normal(0, 0.2, 3)), 0, 1)
-        cv2.circle(dark, centre, int(rng.integers(1, 4)), colour.tolist(), -1, cv2.LINE_AA)
+        cv2.circle(dark, centre, int(rng.integers(1, 4)), colour.tolist(), -1)
     return dark
 
 

@@ -1,4 +1,8 @@
-"""Crops to learn from, cut and altered on the computing device: what `samples` and `lures` do, by batches."""
+"""Crops to learn from, cut and altered on the computing device: what `samples` and `lures` do, by batches.
+
+Draws come in other orders, so that one seed gives other crops; what is drawn, and what becomes of a picture
+by the same draws, is the same but for borders and the rims of lights.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +51,7 @@ def lure(image: Tensor, rng: np.random.Generator) -> Tensor:
         return (image * gain ** (1 / GAMMA)).clamp(max=1)
     radius = float(np.exp(rng.uniform(np.log(1.5), np.log(12.0))))
     if kind < 0.4:
-        return defocused(_at_night(image, rng), radius)
+        return defocused(at_night(image, rng), radius)
     blurred = defocused(image, radius)
     if rng.random() < 0.4:
         return blurred
@@ -66,8 +70,8 @@ def defocused(image: Tensor, radius: float) -> Tensor:
     return F.conv2d(wide, kernel)[:, 0].clamp(0, 1) ** (1 / GAMMA)
 
 
-def _at_night(image: Tensor, rng: np.random.Generator) -> Tensor:
-    """The picture darkened, with small lights in a few colours."""
+def at_night(image: Tensor, rng: np.random.Generator) -> Tensor:
+    """The picture (3,H,W) darkened, with small lights in a few colours; see `lures.at_night`."""
     height, width = image.shape[1:]
     count = int(rng.integers(4, 30))
     at = rng.random((2, count)) * [[height], [width]]

@@ -119,7 +119,7 @@ def _draw(
         image, part, weight = image[:, ::-1], part[:, ::-1], weight[:, ::-1]
     if dry and lures > 0 and rng.random() < lures:
         image = lure(image, rng)
-    image = _photographed(image, rng)
+    image = photographed(image, rng)
     return image, np.ascontiguousarray(part), np.ascontiguousarray(weight)
 
 
@@ -137,7 +137,7 @@ def _offset(rng: np.random.Generator, length: int, size: int) -> int:
     return int(rng.integers(length - size + 1))
 
 
-def _photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def photographed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The image with other exposure, contrast, colour cast and noise, in [0,1]."""
     if rng.random() < 0.1:
         image = image[..., rng.permutation(3)]

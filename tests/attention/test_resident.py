@@ -7,11 +7,19 @@ import pytest
 import torch
 
 from pipeline.attention import lures, pools, samples
-from pipeline.attention.resident import defocused, draw_resident, lure, visibility
+from pipeline.attention.resident import (
+    at_night,
+    defocused,
+    draw_resident,
+    lure,
+    photographed,
+    visibility,
+)
 from pipeline.attention.samples import Pool
 from pipeline.attention.training import Phase, Trainer
 from pipeline.attention.unet import DropUNet
 from pipeline.geometry.crops import resident
+from tests.answers import answers
 
 
 def _pool(size: int = 64) -> Pool:
@@ -21,6 +29,14 @@ def _pool(size: int = 64) -> Pool:
     cover[20:40, 20:40] = 255
     wet = [np.where(cover[..., None] > 0, 255, each).astype(np.uint8) for each in clean]
     return Pool(wet, clean, [cover] * 3)
+
+
+def _planes(image: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(image).permute(2, 0, 1)
+
+
+def _picture(planes: torch.Tensor) -> np.ndarray:
+    return planes.permute(1, 2, 0).numpy()
 
 
 def test_batches_are_bgr_in_range_and_repeatable() -> None:
@@ -52,18 +68,58 @@ def test_dry_crops_show_no_drop_and_only_they_are_made_to_look_wet() -> None:
 
 def test_lenses_and_weights_are_those_of_the_other_way() -> None:
     image = np.random.default_rng(0).random((40, 50, 3), dtype=np.float32)
-    planes = torch.from_numpy(image).permute(2, 0, 1)
     inner = slice(8, -8)  # borders are continued one pixel apart
-    found = defocused(planes, 4.3).permute(1, 2, 0).numpy()
+    found = _picture(defocused(_planes(image), 4.3))
     assert np.allclose(found[inner, inner], lures.defocused(image, 4.3)[inner, inner], atol=1e-4)
     pool = _pool()
     parts = [np.float32(part[0]) / 255 for part in (pool.rainy, pool.clean, pool.coverage)]
     tensors = [torch.from_numpy(np.atleast_3d(part)).permute(2, 0, 1)[None] for part in parts]
     weight = visibility(*tensors)[0, 0].numpy()
     assert np.array_equal(weight[4:-4, 4:-4], samples.visibility(*parts)[4:-4, 4:-4])
+
+
+def test_the_same_draws_out_of_focus_or_overexposed_make_the_same_picture() -> None:
+    image = np.random.default_rng(0).random((60, 70, 3), dtype=np.float32)
+    inner = (slice(13, -13), slice(13, -13))  # borders are continued one pixel apart
     for seed in range(30):
-        lured = lure(planes, np.random.default_rng(seed))
-        assert lured.shape == planes.shape and 0 <= lured.min() <= lured.max() <= 1
+        found = lure(_planes(image), np.random.default_rng(seed))
+        assert found.shape == (3, 60, 70) and 0 <= found.min() <= found.max() <= 1
+        if (
+            not 0.25 <= np.random.default_rng(seed).random() < 0.4
+        ):  # lights are drawn in other orders
+            beside = lures.lure(image, np.random.default_rng(seed))
+            assert np.allclose(_picture(found)[inner], beside[inner], atol=1e-4), seed
+
+
+@pytest.mark.parametrize("place", [0.25, 0.5, 0.75])
+def test_lightsat_night_have_the_same_place_size_and_colour_but_for_their_rims(
+    place: float,
+) -> None:
+    image = np.full((40, 60, 3), 0.8, np.float32)
+    beside = lures.at_night(image, answers(place))
+    found = _picture(at_night(_planes(image), answers(place)))
+    y, x = np.mgrid[:40, :60]
+    away, radius = np.hypot(y - 40 * place, x - 60 * place), 1 + int(3 * place)
+    core, rim = away <= radius - 0.5, abs(away - radius) < 0.5
+    assert np.allclose(found[~rim], beside[~rim], atol=1e-6)
+    assert np.allclose(beside[core], beside[core][0]) and (beside[core] != beside[0, 0]).all()
+    assert np.allclose(beside[away >= radius + 0.5], 0.8 * (0.15 + 0.35 * place))
+
+
+@pytest.mark.parametrize(
+    ("place", "changed"), [(0.05, True), (0.2, True), (0.4, True), (0.6, True), (0.9, False)]
+)
+def test_a_camera_set_otherwise_makes_the_same_of_a_picture(
+    place: float, changed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The smaller `place`, the more is done: light and colour, then grain, a soft lens, swapped colours."""
+    monkeypatch.setattr(torch, "randn", lambda shape, **_: torch.ones(shape))
+    image = np.random.default_rng(0).random((40, 50, 3), dtype=np.float32)
+    beside = samples.photographed(image, answers(place))
+    found = photographed(_planes(image)[None], answers(place), torch.Generator())[0]
+    inner = (slice(5, -5), slice(5, -5))
+    assert np.allclose(_picture(found)[inner], beside[inner], atol=1e-4)
+    assert bool((beside != image).any()) == changed
 
 
 @pytest.mark.parametrize("target", ["coverage", "difference"])

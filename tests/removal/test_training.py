@@ -23,6 +23,7 @@ from pipeline.removal.recipes import Added, AnyRecipe, recipe_of, weights_of
 from pipeline.removal.samples import Pairs, draw_batch, draw_resident, drop_map
 from pipeline.removal.training import Phase, Plan, Trainer, fit
 from pipeline.removal.wen import Frames, mend
+from tests.answers import answers
 
 
 def recipe(method: str) -> AnyRecipe:
@@ -228,6 +229,21 @@ def test_crops_cut_on_the_device_hold_the_same_things() -> None:
             assert torch.equal(one, two) and one.shape == other.shape and one.dtype == other.dtype
         assert torch.equal(found.drops, drop_map(found.rainy, found.clean))
         assert float(found.rainy.min()) >= 0 and 0 < float(found.drops.mean()) < 1
+
+
+@pytest.mark.parametrize("place", [0.1, 0.4, 0.6])
+def test_a_camera_set_otherwise_makes_the_same_of_both_partners_there(place: float) -> None:
+    """Of even pictures: where a crop is taken from, and at which scale, makes no difference."""
+    clean = np.full((40, 40, 3), (90, 120, 150), np.uint8)
+    pool = Pairs([clean + 60], [clean], [np.full((40, 40), 255, np.uint8)])
+    beside = draw_batch([pool], answers(place), 1, 32)
+    found = draw_resident(resident([pool], "cpu"), answers(place), 1, 32)
+    for one, other in zip(found, beside, strict=True):
+        assert torch.allclose(one, other, atol=1e-5)
+    as_it_was = bool(
+        torch.allclose(beside.clean[0, 0, :, 0, 0] * 255, torch.tensor([90.0, 120, 150]))
+    )
+    assert as_it_was == (place > 0.5)
 
 
 def test_batches_hold_both_partners_alike_and_clips_their_frames() -> None:
