@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
 import torch
@@ -14,8 +13,8 @@ from pipeline.attention.samples import Pool
 from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit, score
 from pipeline.attention.weights import averaged, first_network, load_others, save_network
 from pipeline.drops.pairs import KINDS, Kind
-from pipeline.io import checkpoints
 from pipeline.io.atomic import write_csv
+from pipeline.io.checkpoints import load_checkpoint, save_checkpoint, training_key
 from pipeline.io.paths import ScenePaths
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
@@ -68,23 +67,24 @@ def main(job: Job, params: Params) -> str:
     told = params.model_dump(include={"seed", "clean_share", "lures", "bfloat16", "on_device"})
     trainer = Trainer(network, training, phases, **told)
     others = load_others({job.resolve(p): s for p, s in params.average.items()}, params.model)
-    key = checkpoints.training_key(params.model_dump(exclude={"weights", "average"}), start)
+    named = filter(None, (params.start, params.photos, *params.rendered, *params.photo_pairs,
+                          params.validation_photos, *params.validation_rendered))  # fmt: skip
+    key = training_key(params.model_dump(exclude={"weights", "average"}), *map(job.resolve, named))
     checkpoint = job.paths.work("train_detector") / f"{key}.pt"
-    rows = checkpoints.load_checkpoint(checkpoint, trainer)
+    rows = load_checkpoint(checkpoint, trainer)
     with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:
 
         def on_score(done: int, steps: int, loss: float, found: dict[str, Score]) -> None:
             bar.update(done - bar.n)
             rows.extend(curve_rows(done, steps, loss, found))
             bar.write(" ".join(f"{name} F1 {each.f1:.3f}" for name, each in found.items()))
-            checkpoints.save_checkpoint(checkpoint, trainer, rows)
+            save_checkpoint(checkpoint, trainer, rows)
 
-        trained = fit(trainer, validate_every=params.validate_every, validation=validation,
-                      on_score=on_score)  # fmt: skip
+        trained = fit(trainer, params.validate_every, validation, on_score)
     if others:
         trained = averaged(trained.cpu(), others)
         found = {name: score(trained, pool, phases[-1].steps) for name, pool in validation.items()}
-        rows.extend(curve_rows(trainer.done, phases[-1].steps, math.nan, found))
+        rows.extend(curve_rows(trainer.done, phases[-1].steps, float("nan"), found))
     save_network(target := job.resolve(params.weights), trained)
     write_csv(target.with_suffix(".csv"), CURVE, rows)
     return f"{target.name}: best F1 {rows[-1][7]} on {rows[-1][3]} pictures it was not trained on"

@@ -62,9 +62,10 @@ def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
     trainer = _trainer(job, params, method)
     room, name = (clips, "clips") if method == "wen" else (pools, "painted")
     unseen = _painted(job, room, params.validation_photos, params.seed + 1, params.validation)
-    others = {"attgan", "quan", "wen"} - {method}
-    files = [job.resolve(path) if path else None for path in (params.attention, params.perceptual)]
-    key = checkpoints.training_key(params.model_dump(exclude={"folder", *others}), *files)
+    told = params.model_dump(exclude={"folder", "attgan", "quan", "wen"} - {method})
+    named = filter(None, (params.attention, params.perceptual, params.photos, *params.rendered,
+                          *params.photo_pairs, params.validation_photos))  # fmt: skip
+    key = checkpoints.training_key(told, *map(job.resolve, named))
     checkpoint = (work := job.paths.work("train_remover")) / f"{method}-{key}.pt"
     rows = checkpoints.load_checkpoint(checkpoint, trainer)
     with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:
@@ -97,10 +98,9 @@ def _trainer(job: Job, params: Params, method: Method) -> Trainer:
              if part[0] and share > 0]  # fmt: skip
     plan: Plan = getattr(params, method)
     moving = any(phase.kind == "clips" for phase in plan.phases)
-    shots = _painted(job, clips, params.photos, params.seed, params.clips) if moving else ()
-    return Trainer(recipe, pairs, [Pairs(*shots)] if shots else [], plan, seed=params.seed,
-                   bfloat16=params.bfloat16, single_share=params.single_share, perceptual=backbone,
-                   on_device=params.on_device)  # fmt: skip
+    shots = [_painted(job, clips, params.photos, params.seed, params.clips)] if moving else []
+    settings = params.model_dump(include={"seed", "bfloat16", "single_share", "on_device"})
+    return Trainer(recipe, pairs, [Pairs(*s) for s in shots], plan, perceptual=backbone, **settings)
 
 
 def _painted(job: Job, room: ModuleType, folder: str, seed: int, count: int) -> pools.Pictures:

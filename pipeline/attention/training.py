@@ -19,12 +19,14 @@ from pipeline.attention.resident import draw_resident
 from pipeline.attention.samples import VISIBLE_COVERAGE, Pool, draw_batch, wetness
 from pipeline.attention.unet import DropUNet
 from pipeline.attention.weights import Detector
+from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
 
 THETA = 0.8
 # Columns of the validation curve; see `curve_rows`.
 CURVE = ("iteration", "steps", "loss", "set", "threshold", "precision", "recall", "f1", "iou")
 EMA_DECAY = 0.995
+THRESHOLDS = np.arange(2, 20) / 20
 
 
 @dataclass(frozen=True)
@@ -212,9 +214,6 @@ def _is_matrix(name: str, parameter: Tensor) -> bool:
     return parameter.ndim == 4 and not name.startswith(("det_conv_mask", "last"))
 
 
-THRESHOLDS = np.arange(2, 20) / 20
-
-
 def score(network: Detector, pool: Pool, steps: int) -> Score:
     """How well the network finds the water of a pool it was not trained on, at its best threshold.
 
@@ -267,7 +266,6 @@ def curve_rows(
 
 def fit(
     trainer: Trainer,
-    *,
     validate_every: int,
     validation: Mapping[str, Pool],
     on_score: Callable[[int, int, float, dict[str, Score]], None],
@@ -276,12 +274,17 @@ def fit(
 
     on_score(iterations done, recurrent steps, mean loss since the last call, score per validation
     pool) is called every `validate_every` iterations and at the end of each phase: there a
-    checkpoint is written.
+    checkpoint is written. UserError once the loss is no number, which it stays.
     """
     losses: list[float] = []
     while not trainer.finished:
         steps = trainer.phases[trainer.phase].steps
         losses.append(trainer.advance())
+        if not math.isfinite(losses[-1]):
+            raise UserError(
+                f"The training broke down near step {trainer.done}.",
+                "Lower the rate of the phase under train_detector.",
+            )
         if trainer.iteration % validate_every == 0:  # 0 after the last one of a phase, too
             result = {
                 name: score(trainer.average, pool, steps) for name, pool in validation.items()

@@ -24,11 +24,19 @@ class Resumable(Protocol):
     def restore(self, state: dict[str, Any]) -> None: ...
 
 
-def training_key(told: Mapping[str, Any], *files: Path | None) -> str:
-    """A name for one training: its parameters and the bytes of the files that it starts from."""
+def training_key(told: Mapping[str, Any], *sources: Path) -> str:
+    """A name for one training: its parameters, and the bytes of what it starts and learns from.
+
+    sources: files, and folders of which every file counts under its name; what is not there counts as
+    nothing, since who needs it says so.
+    """
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
-    for file in files:
-        digest.update(file.read_bytes() if file else b"")
+    for source in sources:
+        if source.is_file():
+            digest.update(source.read_bytes())
+        for file in sorted(path for path in source.rglob("*") if path.is_file()):
+            digest.update(file.relative_to(source).as_posix().encode())
+            digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 
 

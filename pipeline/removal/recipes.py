@@ -44,7 +44,7 @@ class Added:
     quan_guides: float = 0
     wen_mended: float = 0
 
-    __pydantic_config__: ClassVar = {"extra": "forbid"}  # of params.yaml
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}  # of params.yaml
 
     def __post_init__(self) -> None:
         if min(self.quan_squares, self.quan_guides, self.wen_mended) < 0:
@@ -178,9 +178,10 @@ def recipe_of(
     if method == "attgan":
         assert attention is not None
         recipe = AttganRecipe(attention, map_loss, train_attention=train_attention, steps=steps)
+    elif method == "quan":
+        recipe = QuanRecipe(added, published_edges=published_edges)
     else:
-        quans = method == "quan"
-        recipe = QuanRecipe(added, published_edges=published_edges) if quans else WenRecipe(added)
+        recipe = WenRecipe(added)
     recipe.begin(seed)
     return recipe
 

@@ -59,15 +59,11 @@ def draw_batch(pools: Sequence[Pairs], rng: np.random.Generator, batch: int, cro
     for _ in range(batch):
         pool = pools[rng.choice(len(pools), p=shares / shares.sum())]
         index = int(rng.integers(len(pool.rainy)))
-        frames = [
-            part[index] if part[index].ndim == 4 else part[index][None]
-            for part in (pool.rainy, pool.clean)
-        ]
-        drawn.append(_draw(frames[0], frames[1], pool.coverage[index], rng, crop))
-    rainy, clean = (
-        torch.from_numpy(np.stack([pair[k] for pair in drawn]).transpose(0, 1, 4, 2, 3).copy())
-        for k in (0, 1)
-    )
+        pair = np.stack([pool.rainy[index], pool.clean[index]])
+        if pair.ndim == 4:  # single pictures are clips of one frame
+            pair = pair[:, None]
+        drawn.append(_draw(pair, pool.coverage[index], rng, crop))
+    rainy, clean = torch.from_numpy(np.stack(drawn, 1).transpose(0, 1, 2, 5, 3, 4).copy())
     return Batch(rainy, clean, drop_map(rainy, clean))
 
 
@@ -85,15 +81,14 @@ def draw_resident(
     return Batch(rainy, clean, drop_map(rainy, clean))
 
 
-def _draw(
-    rainy: np.ndarray, clean: np.ndarray, cover: np.ndarray, rng: np.random.Generator, crop: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _draw(pair: np.ndarray, cover: np.ndarray, rng: np.random.Generator, crop: int) -> np.ndarray:
+    """A crop (2,T,crop,crop,3) in [0,1] of a pair (2,T,H,W,3) uint8 whose water is `cover` (H,W)."""
     size = min(window_side(rng, crop, ZOOM), *cover.shape)
     # Of two places the wetter one: most of a picture is dry, and there is little to learn there.
     places = [tuple(int(rng.integers(n - size + 1)) for n in cover.shape) for _ in range(2)]
     wet = [int(cover[y : y + size : 4, x : x + size : 4].sum()) for y, x in places]
     y, x = places[int(np.argmax(wet))]
-    pair = np.stack([rainy, clean])[:, :, y : y + size, x : x + size].astype(np.float32) / 255
+    pair = pair[:, :, y : y + size, x : x + size].astype(np.float32) / 255
     if size != crop:
         how = cv2.INTER_AREA if size > crop else cv2.INTER_LINEAR
         flat = pair.reshape(-1, *pair.shape[2:])
@@ -104,5 +99,4 @@ def _draw(
     if rng.random() < 0.5:  # what a camera set otherwise would have made of both
         pair = np.power(pair, np.exp(rng.uniform(-0.25, 0.25)))
         pair = pair * np.exp(rng.normal(0, 0.1) + rng.normal(0, 0.04, 3))
-    both = np.clip(pair, 0, 1).astype(np.float32)
-    return both[0], both[1]
+    return np.clip(pair, 0, 1).astype(np.float32)

@@ -39,11 +39,13 @@ class Phase:
     rate: float
     power: float | None
 
-    __pydantic_config__: ClassVar = {"extra": "forbid"}  # of params.yaml
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}  # of params.yaml
 
     def __post_init__(self) -> None:
         if min(self.iterations, self.batch, self.crop) < 1 or not 0 < self.rate <= 1:
             raise ValueError("iterations, batch and crop start at 1, the rate lies in (0, 1]")
+        if self.power is not None and self.power < 0:
+            raise ValueError("a rate that falls as a power has one of 0 or more")
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Plan:
     critic_rate: float
     phases: list[Phase]
 
-    __pydantic_config__: ClassVar = {"extra": "forbid"}  # of params.yaml
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}  # of params.yaml
 
     def __post_init__(self) -> None:
         if not all(0 <= beta < 1 for beta in self.betas) or not self.phases:
@@ -81,7 +83,7 @@ class Trainer:
         *, seed: int, bfloat16: bool = False, single_share: float = 0.0,
         perceptual: nn.Module | None = None, on_device: bool = False,
     ) -> None:  # fmt: skip
-        _check(recipe, pairs, clips, plan)
+        _check(recipe, pairs, clips, plan, single_share)
         self.recipe, self.pairs, self.clips = recipe, pairs, clips
         where = str(_device(recipe)) if on_device else None
         self.stacks = [resident(pools, where) for pools in (pairs, clips)] if where else []
@@ -236,17 +238,25 @@ def _device(recipe: nn.Module) -> torch.device:
     return next(recipe.parameters()).device
 
 
-def _check(recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs], plan: Plan) -> None:
+def _check(
+    recipe: AnyRecipe, pairs: Sequence[Pairs], clips: Sequence[Pairs],
+    plan: Plan, single_share: float,
+) -> None:  # fmt: skip
+    """UserError for a plan that this recipe cannot follow with these pictures."""
     for phase in plan.phases:
         check_crop(recipe, phase.crop, plan.adversarial > 0)
-        if phase.kind == "clips" and not recipe.clips:
+        moving = phase.kind == "clips"
+        if moving and not recipe.clips:
             raise UserError(
                 "Only wen looks at several frames; the others learn from pairs.",
                 "Set the kind of the phase to pairs under train_remover.",
             )
-        if not (clips if phase.kind == "clips" else pairs):
+        if moving and not clips:
+            raise UserError("There are no clips to train on.", "Give some under train_remover.")
+        if not pairs and (not moving or single_share > 0):
             raise UserError(
-                f"There are no {phase.kind} to train on.", "Give some under train_remover."
+                "There are no pairs to train on.",
+                "Give some under train_remover, and a share of them above 0.",
             )
 
 
@@ -270,10 +280,16 @@ def fit(
 
     on_score(mean loss since the last call, PSNR before and after per validation pool) is called
     every `validate_every` iterations and at the end of each phase: there a checkpoint is written.
+    UserError once the loss is no number, which it stays.
     """
     losses: list[float] = []
     while not trainer.finished:
         losses.append(trainer.advance())
+        if not math.isfinite(losses[-1]):
+            raise UserError(
+                f"The training broke down near step {trainer.done}.",
+                "Lower the rate of the phase under train_remover.",
+            )
         if trainer.iteration % validate_every == 0:  # 0 after the last one of a phase, too
             found = {name: trainer.score(pool) for name, pool in validation.items()}
             on_score(float(np.mean(losses)), found)

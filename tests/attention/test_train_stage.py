@@ -79,12 +79,12 @@ def test_weights_and_curve_and_the_same_after_an_interruption(
     job = Job(root, "made", None, "cpu", None, False)
     fit = train_detector.fit
 
-    def stopped(trainer, *, on_score, **rest):
+    def stopped(trainer, every, validation, on_score):
         def once(*found):
             on_score(*found)
             raise KeyboardInterrupt
 
-        return fit(trainer, on_score=once, **rest)
+        return fit(trainer, every, validation, once)
 
     monkeypatch.setattr(train_detector, "fit", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -107,6 +107,11 @@ def test_weights_and_curve_and_the_same_after_an_interruption(
         == f"unet.safetensors: best F1 {float(rows[-1]['f1'])} on painted pictures it was not trained on"
     )
     assert load_network(root / "w/unet.safetensors", "unet").reach() > 0
+
+    write_image(root / "rendered/rainy/0.png", np.full((48, 64, 3), 90, np.uint8))
+    monkeypatch.setattr(train_detector, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        main(job, PARAMS)  # other pictures: from the start, not from the training that has ended
 
 
 def test_trained_weights_are_averaged_with_others_and_scored_anew(root: Path) -> None:

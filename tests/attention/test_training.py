@@ -20,6 +20,7 @@ from pipeline.attention.training import (
     Trainer,
     attention_loss,
     count,
+    fit,
     overlap_loss,
     score,
     scores,
@@ -163,6 +164,16 @@ def test_an_interrupted_fit_ends_like_one_that_was_not(
         one.average.state_dict().values(), two.average.state_dict().values(), strict=True
     ):
         assert torch.equal(a, b)
+
+
+def test_a_fit_that_broke_down_ends_with_a_sentence() -> None:
+    network = DropUNet()
+    network.initialise(0)
+    with torch.no_grad():
+        network.last.weight.fill_(float("nan"))
+    trainer = Trainer(network, [_pool()], [Phase(1, 2, 2, 32, 0.02)], seed=1, clean_share=0.1)
+    with pytest.raises(UserError, match="broke down near step 1"):
+        fit(trainer, 5, {}, lambda *_: None)
 
 
 def test_half_precision_trains_too() -> None:

@@ -103,3 +103,8 @@ def test_weights_and_curve_and_the_same_after_an_interruption(
     attention, autoencoder = restore.networks_of("attgan", target, "", "cpu")
     count = [sum(value.numel() for value in part.parameters()) for part in (attention, autoencoder)]
     assert sum(count) == 6_244_362
+
+    write_image(root / "pairs/data/0_rain.png", np.full((48, 64, 3), 90, np.uint8))
+    monkeypatch.setattr(train_remover, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        train()  # other pictures: from the start, not from the training that has ended

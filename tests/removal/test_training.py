@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydantic import TypeAdapter
 from torch.nn import functional as F
 
 from pipeline.attention.network import AttentiveRecurrentNet
@@ -392,7 +393,25 @@ def test_what_cannot_be_trained_is_told_in_a_sentence(method: str, wrong: Plan, 
         Trainer(recipe(method), [pictures()], [], wrong, seed=0)
 
 
+def test_single_pictures_between_clips_need_pairs() -> None:
+    with pytest.raises(UserError, match="There are no pairs to train on"):
+        Trainer(recipe("wen"), [], [pictures(5)], plan("clips"), seed=0, single_share=0.1)
+
+
+def test_a_training_that_broke_down_ends_with_a_sentence() -> None:
+    trainer = Trainer(recipe("quan"), [pictures()], [], plan("pairs"), seed=0)
+    with torch.no_grad():
+        next(trainer.recipe.parameters()).fill_(math.nan)
+    with pytest.raises(UserError, match="broke down near step 1"):
+        fit(trainer, 5, {}, lambda loss, found: None)
+
+
 def test_numbers_out_of_range_are_refused() -> None:
+    with pytest.raises(ValueError, match="0 or more"):
+        Phase("pairs", 1, 1, 32, 0.1, -0.3)
+    with pytest.raises(ValueError, match="finite"):
+        TypeAdapter(Plan).validate_python({"betas": (0, 0), "adversarial": math.inf, "critic_rate": 1,
+                                           "phases": [Phase("pairs", 1, 1, 32, 0.1, None)]})  # fmt: skip
     for values in (("pairs", 0, 1, 32, 0.1, None), ("pairs", 1, 1, 32, 0.0, None)):
         with pytest.raises(ValueError, match="the rate lies in"):
             Phase(*values)  # type: ignore[arg-type]
