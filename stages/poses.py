@@ -23,13 +23,8 @@ from pipeline.stage import Job, Section, run
 log = logging.getLogger(__name__)
 
 SETTINGS = {
-    "camera",
-    "mapper",
-    "max_features",
-    "max_image_size",
-    "refine_focal",
-    "refine_distortion",
-}
+    "camera", "mapper", "max_features", "max_image_size", "refine_focal", "refine_distortion",
+}  # fmt: skip
 
 
 class Params(Section):
@@ -52,6 +47,7 @@ class Params(Section):
     align_first_steps: Annotated[int, Field(ge=1)]
     align_steps: Annotated[int, Field(ge=1)]
     align_scale: Annotated[float, Field(gt=0, le=1)]
+    align_settled: Annotated[float, Field(ge=0)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
 
 
@@ -98,8 +94,9 @@ def _found(job: Job, params: Params, records: Sequence[ImageRecord]) -> sfm.Reco
     each = partial(map_named, job_label="align", workers=None if job.device == "cpu" else 1)
     fits = (params.align_first_steps, *[params.align_steps] * (params.align_rounds - 1))
     poses = aligned_poses(
-        images, each, fits, params.align_scale, seed=params.seed, device=job.device, threads=cores()
-    )
+        images, each, fits, params.align_scale, landmarks=found.points_xyz, threads=cores(),
+        settled_px=params.align_settled, seed=params.seed, device=job.device,
+    )  # fmt: skip
     return sfm.with_poses(found, poses, params.depth_margin)
 
 

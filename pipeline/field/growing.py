@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,8 +15,12 @@ from pipeline.field.fit import fit
 from pipeline.field.model import build_around
 from pipeline.field.render import RenderedView, render_view, scaled_camera
 from pipeline.field.visibility import Witness, seen_by_others
+from pipeline.geometry.cameras import intrinsic_matrix, project
 from pipeline.io.images import resized
 from pipeline.io.posed import PosedImage
+from pipeline.io.transforms import View
+
+log = logging.getLogger(__name__)
 
 FAR_FACTOR = 2.0  # the world ends this far beyond the farthest sparse point
 ALIGN_RAYS = 1024  # per step of the fits that cameras are aligned to
@@ -136,6 +141,8 @@ def aligned_poses(
     fits: Sequence[int],
     scale: float,
     *,
+    landmarks: np.ndarray,
+    settled_px: float,
     seed: int,
     device: str,
     threads: int,
@@ -143,13 +150,30 @@ def aligned_poses(
     """The images' poses (4, 4) by name, moved so that one field explains their dry pixels best.
 
     A field is fitted for ``fits[0]`` steps, every camera moved onto its photo (:func:`aligned`), the field
-    fitted on for ``fits[1]`` steps, and so forth; at ``scale`` times the photos' size. ``each`` maps a
-    function over tasks by name. Held-out images are moved too, but never fitted.
+    fitted on for ``fits[1]`` steps, and so forth; at ``scale`` times the photos' size. It ends early when
+    a round moves ``landmarks``, points (N, 3) of the scene, by less than ``settled_px`` pixels of the photos
+    on average. ``each`` maps a function over tasks by name. Held-out images are moved too, but never fitted.
     """
     smaller = [scaled_image(image, scale) for image in images]
     field = GrowingField(smaller, FAR_FACTOR, seed, device, **ALIGN_FIELD)
     drop_masks = {image.record.name: ~image.keep_mask for image in smaller}
-    for steps in fits:
+    views = {image.record.name: image.view for image in images}
+    poses = {name: view.cam_from_world for name, view in views.items()}
+    for number, steps in enumerate(fits, start=1):
         field.fit(drop_masks, steps, ALIGN_RAYS, threads)
-        field.place(each(field.aligned, {i.record.name: (i, ALIGN_STEPS) for i in field.images}))
-    return {image.record.name: image.view.cam_from_world for image in field.images}
+        before, tasks = poses, {i.record.name: (i, ALIGN_STEPS) for i in field.images}
+        poses = each(field.aligned, tasks)
+        field.place(poses)
+        moves = [moved_px(landmarks, view, before[n], poses[n]) for n, view in views.items()]
+        log.info("alignment, round %d: points moved by %.3f px", number, np.mean(moves))
+        if np.mean(moves) < settled_px:
+            break
+    return poses
+
+
+def moved_px(points: np.ndarray, view: View, before: np.ndarray, after: np.ndarray) -> float:
+    """How far points (N, 3) move in the photo between two poses, mean over those before both; 0 for none."""
+    camera = intrinsic_matrix(view.fx, view.fy, view.cx, view.cy)
+    (old, old_depth), (new, new_depth) = (project(points, pose, camera) for pose in (before, after))
+    ahead = (old_depth > 0) & (new_depth > 0)
+    return float(np.linalg.norm(new - old, axis=1)[ahead].mean()) if ahead.any() else 0.0

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from scene import camera, photograph
 
 from pipeline.field.align import aligned, lay_on_photo, moved
-from pipeline.field.growing import aligned_poses
+from pipeline.field.growing import aligned_poses, moved_px
 from pipeline.field.render import RenderedView
 from pipeline.geometry.poses import pose_errors
 from pipeline.io.posed import PosedImage
@@ -92,16 +94,32 @@ def in_turn(function: Callable[..., Any], tasks: Mapping[str, tuple[Any, ...]]) 
     return {name: function(*task) for name, task in tasks.items()}
 
 
+def test_points_move_by_focal_length_over_depth() -> None:
+    view = View("one.png", np.eye(4), 80.0, 80.0, 40.0, 30.0, 0.0, 80, 60, 1.0, 9.0)
+    aside = moved(np.eye(4), np.array([0.1, 0, 0, 0, 0, 0.0]))
+    points = np.array([[0, 0, 2.0], [0.5, 0.1, 4.0], [0, 0, -3.0]])  # the last one behind
+    assert moved_px(points, view, np.eye(4), aside) == pytest.approx((4 + 2) / 2)
+    assert moved_px(points[2:], view, np.eye(4), aside) == 0
+
+
 def test_cameras_that_are_all_off_come_nearer_to_the_truth() -> None:
     count, random = 12, np.random.default_rng(5)
     true = {f"{i:02d}.png": camera(i, count) for i in range(count)}
     noise = random.normal(size=(count, 6)) * ([0.02] * 3 + [0.003] * 3)
     told = {name: moved(true[name], noise[i]) for i, name in enumerate(true)}
     images = [photo_at(i, count, told[name]) for i, name in enumerate(true)]
-    found = aligned_poses(images, in_turn, (120, 60), 1.0, seed=0, device="cpu", threads=1)
+    landmarks = np.random.default_rng(6).uniform((-2, -1, 4), (2, 1, 8), (50, 3))
+    align = partial(
+        aligned_poses, images, in_turn, scale=1.0, landmarks=landmarks, seed=0, device="cpu", threads=1
+    )  # fmt: skip
+    found = align(fits=(120, 60), settled_px=0.0)
 
     def off(poses: dict[str, np.ndarray]) -> float:
         return float(np.mean(list(pose_errors(poses, true).centre.values())))
 
     assert off(found) < 0.6 * off(told)
     assert set(found) == set(true)
+    # The first round moves the points by whole pixels, but not by as many as ten: it is the last then.
+    one, settled = align(fits=(120,), settled_px=0.0), align(fits=(120, 60), settled_px=10.0)
+    assert all(np.array_equal(settled[name], one[name]) for name in true)
+    assert any(not np.array_equal(found[name], one[name]) for name in true)
