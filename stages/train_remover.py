@@ -15,6 +15,7 @@ from pipeline.attention.training import attention_loss
 from pipeline.attention.weights import load_network
 from pipeline.io import checkpoints
 from pipeline.io.atomic import write_csv
+from pipeline.io.paths import ScenePaths
 from pipeline.parallel import map_named
 from pipeline.removal import clips, store
 from pipeline.removal.losses import PerceptualLoss
@@ -106,9 +107,8 @@ def _trainer(job: Job, params: Params, method: Method) -> Trainer:
 def _painted(job: Job, room: ModuleType, folder: str, seed: int, count: int) -> pools.Pictures:
     """Pictures (room: pools) or clips on the photos of a folder and procedural ones, made where missing."""
     photos = pools.list_pictures(job.resolve(folder)) if folder else ()
-    work = job.paths.work("train_remover") / room.painted_name(seed, photos)
-    chunks = {f"{k:04d}": (work / f"{k:04d}.npy", seed, k, photos)
-              for k in range(-(-count // room.CHUNK))}  # fmt: skip
+    work = ScenePaths(job.root, job.scene).work("train_remover")  # the same for all variants
+    chunks = room.painted_chunks(work, seed, count, photos)
     map_named(room.paint_chunk, chunks, job_label="painting")
     return pools.together([room.read_chunk(chunk[0]) for chunk in chunks.values()], count)
 

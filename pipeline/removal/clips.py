@@ -99,7 +99,17 @@ def painted_name(seed: int, photos: Sequence[Path]) -> str:
     return stills.painted_name("clips", seed, photos)
 
 
+def painted_chunks(
+    work: Path, seed: int, count: int, photos: tuple[Path, ...]
+) -> dict[str, tuple[Path, int, int, tuple[Path, ...]]]:
+    """What `paint_chunk` needs for the first `count` clips, below `work`, by the chunk's name."""
+    folder = work / painted_name(seed, photos)
+    names = [f"{k:04d}" for k in range(-(-count // CHUNK))]
+    return {name: (folder / f"{name}.npy", seed, int(name), photos) for name in names}
+
+
 def _still(rng: np.random.Generator, photos: Sequence[Path]) -> np.ndarray:
+    """A picture (H,W,3) float32 in [0,1] to pan across: a photo, or a procedural one."""
     if not photos or rng.random() >= PHOTO_SHARE:
         return sample_background(rng, 3 * SIZE)
     return stills.still(photos[int(rng.integers(len(photos)))]).astype(np.float32) / 255

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
+from pipeline.removal.critics import Critic
 from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop, critic_of
 from pipeline.removal.samples import Batch, Pairs, draw_batch, draw_resident
 
@@ -111,10 +112,9 @@ class Trainer:
         return self.phase >= len(self.phases)
 
     def advance(self) -> float:
-        """One iteration; its loss."""
+        """One iteration; its loss, without the discriminator's part."""
         phase = self.phases[self.phase]
-        where = [self.seed, self.phase, self.iteration]
-        rng = np.random.default_rng(where)
+        rng = np.random.default_rng([self.seed, self.phase, self.iteration])
         torch.manual_seed(int(rng.integers(2**31)))
         batch = self._draw(phase, rng)
         self.recipe.train()
@@ -126,14 +126,14 @@ class Trainer:
             with self._precision():
                 outcome = self.recipe.outcome(batch, self.perceptual)
             loss = outcome.loss
-            judged = self.critic is not None and (batch.rainy.shape[1] > 1 or not self.recipe.clips)
-            if judged:
-                assert self.critic is not None
-                fooled = self.critic.fooled(outcome.fake)
-                self._apply(loss + self.plan.adversarial * self.critic.weight * fooled, phase)
-                self._judge(outcome)
-            else:
+            # Wen's discriminator looks at five frames: single pictures pass it by.
+            critic = None if self.recipe.clips and batch.rainy.shape[1] == 1 else self.critic
+            if critic is None:
                 self._apply(loss, phase)
+            else:
+                fooled = critic.fooled(outcome.fake)
+                self._apply(loss + self.plan.adversarial * critic.weight * fooled, phase)
+                self._judge(critic, outcome)
         self.iteration, self.done = self.iteration + 1, self.done + 1
         if self.iteration >= phase.iterations:
             self.phase, self.iteration = self.phase + 1, 0
@@ -166,11 +166,10 @@ class Trainer:
             for name, kept in self.average.state_dict().items():
                 kept.lerp_(new[name], 1 - decay)
 
-    def _judge(self, outcome: Outcome) -> None:
+    def _judge(self, critic: Critic, outcome: Outcome) -> None:
         """The discriminator's own step."""
-        assert self.critic is not None
         self.optimisers[1].zero_grad()
-        loss = self.critic.loss(outcome.fake.detach(), outcome.real, outcome.attention)
+        loss = critic.loss(outcome.fake.detach(), outcome.real, outcome.attention)
         loss.backward()
         self.optimisers[1].step()
 

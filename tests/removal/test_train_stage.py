@@ -69,6 +69,14 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def test_variants_share_what_was_painted(root: Path) -> None:
+    """Each would paint thousands of the same pictures again."""
+    for variant in (None, "gpu"):
+        job = Job(root, "made", variant, "cpu", None, False)
+        train_remover._painted(job, pools, "photos", 5, 4)
+    assert len(list(root.rglob("*.npy"))) == 1
+
+
 def test_weights_and_curve_and_the_same_after_an_interruption(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
