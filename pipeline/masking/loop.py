@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal, NamedTuple
@@ -96,8 +97,7 @@ def repair(
         if told is None or found.mode != done[-1].found.mode:  # else the same maps tell the same
             width = _width(window, found, residuals if told is None else told, cameras)
         redrawn = redrawn_on(glass, residuals, old, width=width)
-        if not redrawn.contrast >= contrast:
-            doubt = f"the disagreement is only {redrawn.contrast:.1f} times as large on it"
+        if doubt := _faint(redrawn.contrast, contrast):
             break
         changed = changed_share(old, redrawn.drop_masks)
         done.append(Round(redrawn.drop_masks, found, width, changed, redrawn))
@@ -118,6 +118,13 @@ def _width(
     if window != "auto":
         return window
     return chosen_window(alike_by_distance(maps, cameras)) if found.mode == "lens" else 0
+
+
+def _faint(contrast: float, least: float) -> str:
+    """Why new masks are not believed when the disagreement on them is `contrast` times the rest's."""
+    if math.isnan(contrast):
+        return "there is too little to tell drops from the rest by"
+    return f"the disagreement is only {contrast:.1f} times as large on it" * (contrast < least)
 
 
 def _doubt(found: Found, use_attention: bool) -> str:

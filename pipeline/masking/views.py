@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -51,7 +52,7 @@ def redraw_views(
     On the glass each cell takes the `quantile` of the residuals over its views; cells with fewer votes
     than `fewest_votes` keep what the old masks say. The `attentions` of all views, gathered likewise,
     have their say (see `redraw`). With a `width` above 0 a view takes the part of its `width` neighbours
-    only: drops may creep. The new masks are grown by `dilation` pixels.
+    only: drops may creep. What is new is grown by `dilation` pixels, what is kept was grown before.
     """
     count = len(drop_masks)
     fitted = sum(values is not None for values in residuals)
@@ -67,7 +68,7 @@ def redraw_views(
         if views not in cache:
             apart = views != everything
             gathered, votes = gather(glass, residuals, views, quantile) if apart else overall
-            old, _ = gather(glass, [m.astype(np.float32) for m in drop_masks], views, None)
+            old, _ = gather(glass, drop_masks, views, None)
             seen = None if attentions is None else gather(glass, attentions, views, None)[0]
             longer = max(drop_masks[0].shape)
             previous = np.nan_to_num(old) > 0.5
@@ -81,16 +82,24 @@ def redraw_views(
     for view, old in enumerate(drop_masks):
         found = redrawn(neighbours(count, view, width))
         margin = glass.to_view(view, found.margin)
-        fresh.append(dilate(np.where(np.isfinite(margin), margin > 0, old), dilation))
-        known.append(np.nan_to_num(glass.to_view(view, found.known.astype(np.float32))).mean())
+        decided = np.nan_to_num(glass.to_view(view, found.known.astype(np.float32)))
+        drops = np.where(np.isfinite(margin), margin > 0, old)
+        fresh.append(drops | dilate(drops & (decided > 0.5), dilation))
+        known.append(decided.mean())
     facts = list(cache.values())
     return RedrawnViews(
         fresh,
         np.nan_to_num(overall[0]),
-        float(np.median([found.contrast for found in facts])),
-        float(np.median([found.level for found in facts])),
+        _median([found.contrast for found in facts]),
+        _median([found.level for found in facts]),
         float(np.mean(known)),
     )
+
+
+def _median(values: Sequence[float]) -> float:
+    """The median of those that are numbers: of some neighbours no drop may be known; NaN of none."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.median(known)) if known else math.nan
 
 
 def fewest_votes(glass: Glass, views: int, with_attention: bool) -> int:

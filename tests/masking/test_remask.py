@@ -272,3 +272,32 @@ def test_attention_averaged_on_the_glass_by_hand() -> None:
     # Otsu parts 0.1 from 0.5 in the middle: 0.3, of which 0.6 are 0.18. The means: 0.7, 0.25, 0.05.
     found = attention_on_glass(LensGlass(1, 3), maps, old)
     assert [mask.tolist() for mask in found] == [[[True, True, False]]] * 2
+
+
+def test_what_is_kept_of_an_old_mask_is_grown_once() -> None:
+    """An old drop lies where nobody votes; in round after round it stays as it was drawn."""
+    drop, kept = np.zeros((60, 90), bool), np.zeros((60, 90), bool)
+    drop[20:40, 50:70], kept[10:20, 5:15] = True, True
+    residual = np.where(drop, 0.1, 0.01).astype(np.float32)
+    residual[:, :25] = np.nan
+    masks = [drop | kept] * 6
+    for _ in range(3):
+        found = redraw_views(LensGlass(60, 90), [residual] * 6, masks, quantile=0.5, dilation=2)
+        masks = found.drop_masks
+        assert np.array_equal(masks[0][:, :25], kept[:, :25])
+        assert masks[0][30, 48] and masks[0][30, 71] and not masks[0][30, 47]
+
+
+def test_neighbours_without_a_residual_leave_the_others_believed() -> None:
+    drop = np.zeros((30, 60), bool)
+    drop[10:20, 10:20] = True
+    blind = np.full(drop.shape, np.nan, np.float32)
+    seen = np.where(drop, 0.1, 0.01).astype(np.float32)
+    nothing = [np.zeros(drop.shape, bool)] * 12
+    found = redraw_views(
+        LensGlass(30, 60), [blind] * 6 + [seen] * 6, nothing, quantile=0.5, width=3
+    )
+    assert found.contrast == pytest.approx(10)
+    assert np.array_equal(found.drop_masks[-1], drop) and not found.drop_masks[0].any()
+    found = redraw_views(LensGlass(30, 60), [blind] * 12, nothing, quantile=0.5, width=3)
+    assert math.isnan(found.contrast) and math.isnan(found.level)

@@ -89,3 +89,17 @@ def test_a_scene_that_is_wrong_everywhere_does_not_redraw_good_masks() -> None:
     # Where no attention was asked, the residual is all there is, and it is followed.
     alone = repair(look, wet, views, drawn, 4.0, rounds=1, use_attention=False, contrast=1.0)
     assert len(alone.rounds) == 2
+
+
+def test_where_no_surface_has_witnesses_it_is_told_so() -> None:
+    views = cameras(4)
+    shape = (views[0].height, views[0].width)
+    masks, dry = [np.zeros(shape, bool)] * 4, [np.zeros(shape, np.float32)] * 4
+    blind: list[np.ndarray | None] = [np.full(shape, np.nan, np.float32)] * 4
+    done = repair(
+        lambda drop_masks, found: blind, dry, views, masks, 3.0,
+        rounds=2, mode="lens", use_attention=False, gather_attention=False,
+    )  # fmt: skip
+    assert (
+        len(done.rounds) == 1 and done.ended == "there is too little to tell drops from the rest by"
+    )
