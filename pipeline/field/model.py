@@ -13,6 +13,7 @@ from llvmlite.binding import get_host_cpu_features
 from pipeline.errors import UserError
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.paper_field import PaperConfig, PaperField
+from pipeline.geometry.rays import UNDISTORT_STEPS
 from pipeline.geometry.spaces import Space, fit_space
 
 # A contracted space holds all that is around the cameras: what they look at fills about a quarter of its sides,
@@ -22,6 +23,7 @@ CONTRACTED_SAMPLES = 32
 CONTRACTED_BINS = 64
 # Most of its table's rows are met by few rays: what these leave there should fade sooner.
 CONTRACTED_DECAY = 3.0
+FOLDS = 2.0 / 3.0  # where 1 + k1 r^2 is less, the picture of a lens with k1 < 0 folds back
 
 
 class Camera(Protocol):
@@ -49,9 +51,14 @@ def scene_space(
     for i, (right, bottom) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
         x = (sizes[:, 0] * right - intrinsics[:, 2]) / intrinsics[:, 0]
         y = (sizes[:, 1] * bottom - intrinsics[:, 3]) / intrinsics[:, 1]
-        r2 = x * x + y * y
-        # One Newton-like step is enough for bounds: distortion moves a corner by a few per cent.
-        gain = 1.0 + intrinsics[:, 4] * r2
+        gain = 1.0 + intrinsics[:, 4] * (x * x + y * y)
+        # For bounds a thousandth is enough: one step for most lenses.
+        for _ in range(UNDISTORT_STEPS):
+            better = 1.0 + intrinsics[:, 4] * (x * x + y * y) / gain**2
+            better = np.maximum(better, FOLDS)
+            if np.abs(better / gain - 1.0).max() < 1e-3:
+                break
+            gain = better
         cam = np.stack([x / gain, y / gain, np.ones_like(x)], -1)
         corners[:, i] = np.einsum("vji,vj->vi", cams[:, :3, :3], cam)
     count = len(cams)

@@ -65,11 +65,14 @@ def _sees(other: Witness, points: np.ndarray) -> np.ndarray:
     x, y, z = other.cam_from_world[:3, :3] @ points + other.cam_from_world[:3, 3:]
     safe = np.maximum(z, 1e-9)
     x, y = x / safe, y / safe
-    gain = 1.0 + k1 * (x * x + y * y)
+    radial = k1 * (x * x + y * y)
+    gain = 1.0 + radial
     height, width = other.keep_mask.shape
     column = np.clip(np.floor(fx * x * gain + cx), -1, width).astype(np.int64)
     row = np.clip(np.floor(fy * y * gain + cy), -1, height).astype(np.int64)
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    # Farther out a lens with k1 < 0 folds points back into its frame.
+    inside &= 1.0 + 3.0 * radial > 0.0
     column, row = np.where(inside, column, 0), np.where(inside, row, 0)
     agrees = np.abs(other.depth[row, column] - z) < TOLERANCE * z
     return inside & other.keep_mask[row, column] & agrees

@@ -65,3 +65,15 @@ def test_a_long_video_is_counted_to_its_end() -> None:
     dry = np.ones((20, 20), bool)
     count = witness_count(wall(0.0, dry), [wall(0.0, dry)] * 256, stride=4)
     assert (count == 256).all()
+
+
+def test_a_lens_that_bends_inwards_sees_nothing_from_beyond_its_frame() -> None:
+    """At radius 2 this lens would show a point at 2 - 0.2 * 8 = 0.4, inside its frame of 0.5: it folds."""
+    bent = (100.0, 100.0, 50.5, 50.5, -0.2)
+    turned = np.eye(4)  # looks along (2, 0, 1), at something that is 1 deep for the other camera
+    turned[:3, :3] = np.array([[1, 0, -2], [0, 5**0.5, 0], [2, 0, 1]]) / 5**0.5
+    dry = np.ones((101, 101), bool)
+    view = Witness(turned, bent, dry, np.full(dry.shape, 5**0.5, np.float32))
+    ahead = Witness(np.eye(4), bent, dry, np.ones(dry.shape, np.float32))
+    assert witness_count(view, [ahead])[25, 25] == 0
+    assert witness_count(view, [view])[25, 25] == witness_count(ahead, [ahead])[25, 25] == 1
