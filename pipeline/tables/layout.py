@@ -69,9 +69,14 @@ def best(table: Table, column: Column) -> tuple[str, bool] | None:
     if column.higher is None or len(known) < 2:
         return None
     sign = 1.0 if column.higher else -1.0
-    first = max(known, key=lambda one: sign * round(mean(table.values(one, column)), column.digits))
+
+    def printed(line: Line) -> float:
+        return sign * round(mean(table.values(line, column)), column.digits)
+
+    first = max(known, key=printed)
     ahead = all(
-        better_beyond_spread(
+        printed(first) > printed(one)
+        and better_beyond_spread(
             table.values(first, column), table.values(one, column), higher=column.higher
         )
         for one in known

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.tables import compose
-from pipeline.tables.layout import best
+from pipeline.tables.layout import Column, Line, Table, best
 from pipeline.tables.rows import PAPER, PAPER_ABLATION, PAPER_SCENES, ROWS
 from pipeline.tables.statistics import mean
 
@@ -97,3 +97,13 @@ def test_masks_and_poses() -> None:
     placed = compose.pose_quality(poses, ["street"])
     assert placed.cells["street", "registered"] == (24.0,)
     assert ("street", "translation") not in placed.cells
+
+
+def test_rows_that_print_alike_claim_nothing_of_each_other() -> None:
+    """29.564 and 29.556 are both 29.56, however small their spreads."""
+    column = Column("psnr", "", "PSNR", 2)
+    cells = {("one", "psnr"): (29.564, 29.5641), ("other", "psnr"): (29.556, 29.5561)}
+    lines = (Line("one", "One"), Line("other", "Other"))
+    assert best(Table("t", "T", lines, (column,), cells), column) == ("one", False)
+    finer = Column("psnr", "", "PSNR", 3)
+    assert best(Table("t", "T", lines, (finer,), cells), finer) == ("one", True)
