@@ -137,7 +137,11 @@ def headline(
     )
     test, ssim = value(metrics, "test.psnr"), value(metrics, "test.ssim")
     if test is None or ssim is None:
-        kept = value(metrics, "selfcheck.kept_psnr")
+        kept, fitted = value(metrics, "selfcheck.kept_psnr"), value(metrics, "fitted.psnr")
+        if fitted is not None:
+            reason = metrics["test"].get("psnr_reason", "not measured")
+            text = f"Views at the photos' own poses reach {fitted:.1f} dB against the dry scene"
+            return f"{text}; of views held out of the fit: {reason}. {poses}"
         text = "Without clean references the views cannot be judged under the drops"
         text += f"; beside them they match the photos to {kept:.1f} dB" if kept is not None else ""
         return f"{text}. {poses}"

@@ -63,3 +63,16 @@ def test_only_the_fit_without_masks_is_called_so() -> None:
     )
     told = headline(OWN, OTHER, "paper")
     assert "than the fit paper." in told and "without masks" not in told
+
+
+def test_with_references_but_no_view_held_out_both_are_told() -> None:
+    told = headline(
+        {
+            "test": {"psnr": None, "psnr_reason": "no held-out view was rendered", "ssim": None},
+            "fitted": {"psnr": 31.24},
+            "poses": OWN["poses"],
+        },
+        None,
+    )
+    assert "31.2 dB against the dry scene" in told and "no held-out view was rendered" in told
+    assert "Without clean references" not in told
