@@ -265,7 +265,7 @@ def main() -> None:
                 continue
             result = measure(scene, row, settings, flags.threads, seen, flags.device)
             if kind == "clean" and masks == "none":
-                if not seen:
+                if not seen and poses == "true":  # other poses have depths of another unit
                     seen = seen_pixels(scene, result.renders)
                     errors = {s: (result.renders[s].rgb - scene.clean[s]) ** 2 for s in seen}
                     inside = [_psnr(errors[s][seen[s]]) for s in seen]
