@@ -69,13 +69,15 @@ def main(job: Job, params: Params) -> str:
     buffer = RayBuffer(photos, params.seed, job.device)
     key = fit_key(field, photos, params.model_dump(), job.device)
     checkpoint = Checkpoint(job.paths.work("nerf") / "checkpoint.safetensors", key)
+    names = [photo.name for photo in photos]
+    del photos  # their pixels lie in the buffer, at a quarter of the size
     steps, record = _fit(job, params, field, buffer, checkpoint)
     about = {
         "steps": steps,
         "seed": params.seed,
         "use_masks": params.use_masks,
         "rays": buffer.count,
-        "photos": [photo.name for photo in photos],
+        "photos": names,
         "gains": None if record.gains is None else record.gains.tolist(),
     }
     with publish_dir(job.paths.nerf) as fresh:
@@ -84,7 +86,7 @@ def main(job: Job, params: Params) -> str:
         write_text(fresh / "fit.csv", "\n".join(["step,loss,psnr", *lines]) + "\n")
     checkpoint.remove()
     psnr = record.rows[-1][2]
-    return f"{len(photos)} photos, {buffer.count:,} pixels, training PSNR {psnr:.2f} dB"
+    return f"{len(names)} photos, {buffer.count:,} pixels, training PSNR {psnr:.2f} dB"
 
 
 def _fit(

@@ -15,7 +15,7 @@ from pipeline.io.atomic import publish_dir, read_json, write_json
 from pipeline.io.images import write_image
 from pipeline.io.maps import read_map, write_map
 from pipeline.io.masks import copy_keep_masks, write_drop_masks
-from pipeline.io.posed import PosedImage, read_posed_images
+from pipeline.io.posed import LOOP_BYTES, PosedImage, read_posed_images
 from pipeline.io.transforms import read_transforms
 from pipeline.masking.account import account
 from pipeline.masking.glass import GlassCamera
@@ -60,7 +60,7 @@ def main(job: Job, params: Params) -> str:
         return f"the masks stay as they are: {why}"
     keep_masks = paths.masks if params.start != "none" else None
     views = read_transforms(paths.poses / "transforms.json")
-    images = read_posed_images(paths.images, keep_masks, views)
+    images = read_posed_images(paths.images, keep_masks, views, LOOP_BYTES)
     records = [image.record for image in images]
     field = GrowingField(images, params.far_factor, params.seed, job.device)
     with publish_dir(paths.refine) as fresh:
@@ -95,19 +95,20 @@ def _look(
     drops = {i.record.name: mask for i, mask in zip(field.images, drop_masks, strict=True)}
     number = len(field.psnr)
     field.fit(drops, params.steps if number else params.first_steps, params.batch_rays, cores())
+
+    def looked(image: PosedImage) -> tuple[np.ndarray, np.ndarray]:
+        """Depth and residual of a view. Its picture is let go: of hundreds it would fill the memory."""
+        name, seen = image.record.name, field.view(image)
+        if image.record.split != "train":
+            write_image(rounds / f"{number}/test/{name}", seen.rgb)
+        return seen.depth, residual(seen.rgb, image.rgb, ~drops[name], True)
+
     tasks = {image.record.name: (image,) for image in field.images}
     workers = None if job.device == "cpu" else 1
-    views = map_named(field.view, tasks, job_label="render", workers=workers)
-    sure = field.sure(views, drops, params.witnesses)
-    found: list[np.ndarray | None] = []
-    for image in field.images:
-        name, rgb = image.record.name, views[image.record.name].rgb
-        if name in sure:
-            found.append(residual(rgb, image.rgb, ~drops[name], sure[name]))
-        else:
-            found.append(None)
-            write_image(rounds / f"{number}/test/{name}", rgb)
-    return found
+    views = map_named(looked, tasks, job_label="render", workers=workers)
+    sure = field.sure({name: depth for name, (depth, _) in views.items()}, drops, params.witnesses)
+    nan = np.float32(np.nan)
+    return [np.where(sure[n], views[n][1], nan) if n in sure else None for n in drops]
 
 
 def _camera(image: PosedImage) -> GlassCamera:

@@ -87,10 +87,11 @@ class RayBuffer:
             raise UserError("No photo is left to fit.", "See poses/poses.json for why.")
         kept, colours, offsets = [], [], [0]
         for photo in photos:
-            kept.append(np.flatnonzero(photo.keep_mask.ravel()) + offsets[-1])
+            kept.append(np.flatnonzero(photo.keep_mask.ravel()).astype(np.int32) + offsets[-1])
             colours.append(np.round(photo.image.reshape(-1, 3) * 255.0).astype(np.uint8))
             offsets.append(offsets[-1] + photo.keep_mask.size)
-        order = np.concatenate(kept).astype(np.int32)
+        order = np.concatenate(kept)
+        kept.clear()
         if order.size == 0:
             raise UserError(
                 "Every pixel of every photo is masked: nothing is left to fit.",
@@ -124,7 +125,8 @@ class RayBuffer:
             order = torch.randperm(
                 self.count, generator=generator, dtype=torch.int32, device=self.device
             )
-            self._shuffled, self._epoch = self._kept[order.long()], epoch
+            self._shuffled = self._kept  # lets go of the last order before the next is made
+            self._shuffled, self._epoch = self._kept.index_select(0, order), epoch
         return self._shuffled[place * size : (place + 1) * size]
 
     def rays(self, pixels: Tensor) -> Batch:

@@ -95,13 +95,13 @@ class GrowingField:
 
     def sure(
         self,
-        views: Mapping[str, RenderedView],
+        depths: Mapping[str, np.ndarray],
         drop_masks: Mapping[str, np.ndarray],
         fewest: int,
     ) -> dict[str, np.ndarray]:
         """Where the field has reason to know what it shows, (H, W) by name of the fitted images.
 
-        There `fewest` other fitted images saw the surface uncovered; `views` of all of them as rendered.
+        There `fewest` other fitted images saw the surface uncovered; `depths` (H, W) as rendered.
         """
         fitted = [image for image in self.images if image.record.split == "train"]
         names = [image.record.name for image in fitted]
@@ -110,7 +110,7 @@ class GrowingField:
                 image.view.cam_from_world,
                 image.view.intrinsics,
                 ~drop_masks[name],
-                views[name].depth,
+                depths[name],
             )
             for name, image in zip(names, fitted, strict=True)
         ]

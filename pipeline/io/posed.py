@@ -17,6 +17,7 @@ from pipeline.io.transforms import View
 
 # Per pixel in a fit: colours as float32, a mask, and in the shuffled rays the colours and two orders.
 HELD_BYTES = 25
+LOOP_BYTES = 36  # and while masks are repaired: attention maps, the rounds' masks, residuals
 MOST_PIXELS = 2**31 - 1  # pixels are numbered through in 32 bits
 
 
@@ -31,15 +32,16 @@ class PosedImage:
 
 
 def read_posed_images(
-    images: Path, keep_masks: Path | None, views: Mapping[str, View]
+    images: Path, keep_masks: Path | None, views: Mapping[str, View], held_bytes: int = HELD_BYTES
 ) -> list[PosedImage]:
     """The images that have a pose, in name order, held-out ones included.
 
     Without a folder of `keep_masks` every pixel is kept. UserError when none has a pose, when a file is
-    missing or damaged, or when the memory that is free cannot hold what a fit of them holds.
+    missing or damaged, or when the memory that is free cannot hold what a fit of them holds: `held_bytes`
+    per pixel.
     """
     records = posed_records(images, views)
-    _refuse_too_large(records)
+    _refuse_too_large(records, held_bytes)
     found = []
     for record in records:
         view = views[record.name]
@@ -71,10 +73,10 @@ def posed_records(
     return records
 
 
-def _refuse_too_large(records: Sequence[ImageRecord]) -> None:
+def _refuse_too_large(records: Sequence[ImageRecord], held_bytes: int) -> None:
     """Told by their listed sizes, before any is read: else the system would end the fit without a word."""
     pixels = sum(record.width * record.height for record in records)
-    needed, free = HELD_BYTES * pixels, free_memory()
+    needed, free = held_bytes * pixels, free_memory()
     if pixels <= MOST_PIXELS and needed <= free:
         return
     width, height = records[0].size

@@ -20,6 +20,7 @@ from pipeline.geometry.rays import pixel_rays
 from pipeline.geometry.spaces import mean_camera
 
 MAX_CELLS = 1_000_000
+BAND = 64  # rows of cells whose quantile over the views is taken at a time
 
 
 class GlassCamera(NamedTuple):
@@ -182,19 +183,30 @@ def gather(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The views' maps on the glass: their mean (eq. 5's, per cell) or a quantile, and the votes.
 
-    `maps[view]` (H, W) may hold NaN for pixels without a vote; None for a view without a map. Out come
-    float32 values, NaN where nobody votes, and the number of votes per cell, int32.
+    `maps[view]` (H, W), bool or float, may hold NaN for pixels without a vote; None for a view without a
+    map. Out come float32 values, NaN where nobody votes, and the number of votes per cell, int32.
     """
-    seen = [glass.from_view(view, values) for view in views if (values := maps[view]) is not None]
-    if not seen:
-        return np.full(glass.shape, np.nan, np.float32), np.zeros(glass.shape, np.int32)
-    stack = np.stack(seen)
-    votes = np.isfinite(stack).sum(axis=0).astype(np.int32)
-    if quantile is not None:
-        return quantile_over_views(stack, quantile), votes
-    total = np.nansum(stack, axis=0, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
+    votes, total = np.zeros(glass.shape, np.int32), np.zeros(glass.shape)
+    kept: list[np.ndarray] = []
+    for view in views:
+        if (values := maps[view]) is not None:
+            seen = glass.from_view(view, values)
+            known = np.isfinite(seen)
+            votes += known
+            if quantile is None:
+                total += np.where(known, seen, np.float32(0))
+            else:
+                kept.append(seen)
+    if quantile is None:
         return (total / np.where(votes > 0, votes, np.nan)).astype(np.float32), votes
+    if not kept:
+        return np.full(glass.shape, np.nan, np.float32), votes
+    # A few rows at a time: the stack of all views may be larger than the photos.
+    bands = [
+        quantile_over_views(np.stack([seen[row : row + BAND] for seen in kept]), quantile)
+        for row in range(0, glass.shape[0], BAND)
+    ]
+    return np.concatenate(bands), votes
 
 
 def quantile_over_views(stack: np.ndarray, quantile: float) -> np.ndarray:

@@ -11,7 +11,7 @@ DARK = 0.02  # pixels darker than this say nothing about the exposure
 
 
 def residual(
-    render: np.ndarray, photo: np.ndarray, keep_mask: np.ndarray, sure: np.ndarray
+    render: np.ndarray, photo: np.ndarray, keep_mask: np.ndarray, sure: np.ndarray | bool
 ) -> np.ndarray:
     """|render - photo|, mean over RGB, (H, W) float32 in [0, 0.3]; the difference is blurred first.
 

@@ -53,16 +53,18 @@ def agreement(stack: np.ndarray, fewest_views: int = FEWEST_VIEWS) -> float:
     seen = ~np.isnan(flat)
     count = seen.sum(axis=0)
     shared = count >= fewest_views
-    flat, seen, count = flat[:, shared], seen[:, shared], count[shared].astype(np.float64)
+    values = flat[:, shared].astype(np.result_type(flat, np.float32), copy=False)  # the stack stays
+    seen, count = seen[:, shared], count[shared].astype(np.float64)
     if count.size < 2:
         return 0.0
-    values = np.where(seen, flat, np.float32(0))
+    values[~seen] = 0
     total = count.sum()
     mean = values.sum(axis=0, dtype=np.float64) / count
     grand = (mean * count).sum() / total
     between = (count * (mean - grand) ** 2).sum() / (count.size - 1)
-    apart = np.where(seen, values - mean.astype(values.dtype), np.float32(0))
-    within = np.square(apart, out=apart).sum(dtype=np.float64) / (total - count.size)
+    values -= mean.astype(values.dtype)
+    values[~seen] = 0
+    within = np.square(values, out=values).sum(dtype=np.float64) / (total - count.size)
     per_cell = (total - (count**2).sum() / total) / (count.size - 1)
     whole = between + (per_cell - 1) * within
     return float((between - within) / whole) if whole > 0 else 0.0

@@ -181,11 +181,12 @@ def test_a_video_has_every_frame_even_sides_and_the_same_bytes(
 
 
 @pytest.mark.parametrize("spare", [-1, 0])
+@pytest.mark.parametrize("held", [25, 36])
 def test_photos_that_do_not_fit_into_memory_are_told_before_any_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spare: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spare: int, held: int
 ) -> None:
-    """Two photos of 64x48 at 25 bytes per pixel: a byte less is refused, just enough is not."""
-    memory, swap = 2 * 64 * 48 * 25 - 10_000 + spare, 10_000
+    """Two photos of 64x48 at 25 bytes per pixel (in the loop 36): a byte less is refused, enough is not."""
+    memory, swap = 2 * 64 * 48 * held - 10_000 + spare, 10_000
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory))
     monkeypatch.setattr(psutil, "swap_memory", lambda: SimpleNamespace(free=swap))
     names = ("a.png", "b.png")
@@ -193,7 +194,7 @@ def test_photos_that_do_not_fit_into_memory_are_told_before_any_is_read(
     write_images_json(tmp_path, records)
     told = r"2 photos of 64x48 need about 0\.0 GB" if spare else r"a\.png does not exist"
     with pytest.raises(UserError, match=told):
-        read_posed_images(tmp_path, None, {name: _view(name) for name in names})
+        read_posed_images(tmp_path, None, {name: _view(name) for name in names}, held)
 
 
 @pytest.mark.parametrize("over", [1, 0])

@@ -93,3 +93,20 @@ def test_windows_hold_neighbours_and_stay_inside() -> None:
     assert neighbours(10, 0, 3) == range(3)
     assert neighbours(10, 9, 3) == range(7, 10)
     assert neighbours(5, 2, 9) == range(5)
+
+
+def test_what_is_gathered_a_few_rows_at_a_time_is_what_all_at_once_give() -> None:
+    rng = np.random.default_rng(3)
+    stack = rng.random((5, 150, 7)).astype(np.float32)
+    stack[rng.random(stack.shape) < 0.3] = np.nan
+    stack[:, 140] = np.nan
+    known = np.isfinite(stack)
+    for quantile in (None, 0.3):
+        found, votes = gather(LensGlass(150, 7), list(stack), range(5), quantile)
+        assert np.array_equal(votes, known.sum(axis=0)) and found.dtype == np.float32
+        with np.errstate(invalid="ignore"):
+            means = np.nansum(stack, axis=0, dtype=np.float64) / known.sum(axis=0)
+        whole = quantile_over_views(stack, quantile) if quantile else means.astype(np.float32)
+        assert np.array_equal(found, whole, equal_nan=True)
+    masks = [stack[view] > 0.5 for view in range(5)]
+    assert np.allclose(gather(LensGlass(150, 7), masks, range(5), None)[0], np.mean(masks, axis=0))

@@ -22,6 +22,7 @@ def test_agreement_by_hand() -> None:
     # A cell that two views see does not count; one that a fourth view does not see counts as before.
     more = np.array([[1, 3, 9], [2, 4, 0], [3, 5, np.nan], [np.nan, np.nan, np.nan]], np.float32)
     assert agreement(more) == pytest.approx(0.625)
+    assert more[0, 2] == 9 and stack.sum() == 18  # they are looked at, not changed
 
 
 def test_agreement_is_one_for_the_same_map_and_none_for_noise() -> None:
