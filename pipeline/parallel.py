@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -40,9 +41,11 @@ def map_named(
     calls run on that Dask cluster, whose workers need the project installed and see the same folders.
     The results do not depend on where they were computed. A failure names the item.
     """
+    # A cluster takes tasks of one name for one task, whoever sent them: two scenes have a frame_0000.png each.
+    mine = secrets.token_hex(8)
     tasks = {
         name: delayed(_call, pure=False)(
-            job_label, name, function, args, dask_key_name=f"{job_label}-{name}"
+            job_label, name, function, args, dask_key_name=f"{job_label}-{name}-{mine}"
         )
         for name, args in sorted(items.items())
     }

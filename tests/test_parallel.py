@@ -3,6 +3,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from subprocess import check_output
 
 import numpy as np
 import pytest
@@ -92,3 +93,25 @@ def test_a_fault_on_the_cluster_names_its_item(tmp_path: Path, cluster: str) -> 
     (tmp_path / "a.jpg").write_text("no photo")
     with pytest.raises(UserError, match=r"a\.jpg is not an image"):
         map_named(examine, {"a.png": (tmp_path / "a.jpg",)}, job_label="test", scheduler=cluster)
+
+
+def test_scenes_that_share_a_cluster_do_not_get_each_others_images(
+    tmp_path: Path, cluster: str
+) -> None:
+    """Frames of two videos have the same names; what one scene has computed is not the other's."""
+    found: dict[str, dict[str, bytes]] = {}
+
+    def run(scene: str) -> None:
+        (tmp_path / scene).mkdir()
+        slow = f"sleep 0.5; echo {scene} | tee {tmp_path / scene}"
+        items = {name: (["sh", "-c", f"{slow}/{name}"],) for name in ("a.png", "b.png", "c.png")}
+        found[scene] = map_named(check_output, items, job_label="attention", scheduler=cluster)
+
+    threads = [threading.Thread(target=run, args=(scene,)) for scene in ("garden", "street")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for scene in ("garden", "street"):
+        assert set(found[scene].values()) == {f"{scene}\n".encode()}
+        assert len(list((tmp_path / scene).iterdir())) == 3
