@@ -90,7 +90,7 @@ def _from_photos(
     if capture.views:
         write_transforms(folder / GIVEN_POSES, intake.given_views(capture, plan, size, straighten))
     share = intake.write_given_masks(folder / GIVEN_MASKS, capture, photos, plan, size, straighten)
-    said = plan.said + (intake.masks_said(capture.masked_by, share) if share is not None else [])
+    said = plan.said + intake.masks_said(capture.masked_by, share, photos)
     return records, Origin("photos", capture.posed_by, capture.masked_by, plan.left_out, said)
 
 

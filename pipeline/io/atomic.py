@@ -189,8 +189,12 @@ def read_json(path: Path, made_by: str = "", shape: Shape = dict[str, Any]) -> d
 def read_npy(path: Path) -> np.ndarray:
     """The array in a .npy file; UserError when it is damaged or holds Python objects."""
     try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        found = np.load(path, allow_pickle=False)
+        if not isinstance(found, np.ndarray):  # an archive of several
+            found.close()
+            raise ValueError("it holds several arrays, as numpy.savez writes them")
+        return found
+    except Exception as error:  # what a damaged header or archive raises has no common kind
         raise UserError(
             f"{path} is not a readable array ({error}).", "Save it anew with numpy.save."
         ) from None

@@ -73,12 +73,13 @@ def find_capture(folder: Path, at_least: int, read_colmap: ColmapReader) -> Capt
             views, posed_by = read_poses_bounds(folder / POSES_BOUNDS, _files(photos)), "LLFF"
         elif model is not None:
             views, posed_by = read_colmap(model, _files(photos)), "COLMAP"
+    masks, rain_mask = _masks(folder, photos, views), folder / RAIN_MASK
     return Capture(
         photos=dict(sorted(photos.items())),
         posed_by=posed_by,
         views={image_name(view.photo): view for view in views},
-        masks=_masks(folder, photos, views),
-        rain_mask=folder / RAIN_MASK if (folder / RAIN_MASK).is_file() else None,
+        masks=masks,
+        rain_mask=rain_mask if rain_mask.is_file() and not masks else None,
         model=model,
     )
 
@@ -94,9 +95,13 @@ def _videos(folder: Path) -> list[Path]:
 
 
 def _only_video(folder: Path, videos: list[Path]) -> Path:
-    photos = [path for path in folder.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES]
-    if len(videos) > 1 or photos:
-        more = videos[1] if len(videos) > 1 else min(photos)
+    """The video; UserError beside another, photos, or poses, which are those of photos."""
+    others = [path for path in folder.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES]
+    others += [path for name in (TRANSFORMS, POSES_BOUNDS) if (path := folder / name).is_file()]
+    if model := find_model(folder):
+        others.append(min(path for path in model.iterdir() if path.stem == "cameras"))
+    if len(videos) > 1 or others:
+        more = videos[1] if len(videos) > 1 else min(others)
         raise UserError(
             f"{folder} holds {videos[0].name} and {more.name}.",
             "A scene is one video, or photos; move the others away.",
@@ -122,17 +127,24 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _photo_folder(folder: Path) -> Path:
-    """Where the photos of a posed capture lie: here, in images/, or in the largest images_<factor>/."""
-    if any(path.suffix.lower() in PHOTO_SUFFIXES for path in folder.iterdir()):
-        return folder
+    """Where the photos of a posed capture lie: here, in images/, or in the largest images_<factor>/.
+
+    Where most of them lie: a stray picture above them is not the capture.
+    """
     smaller = sorted(
         (path for path in folder.glob("images_*") if path.name[7:].isdigit()),
         key=lambda path: int(path.name[7:]),
     )
-    for candidate in (folder / "images", *smaller):
-        if candidate.is_dir():
-            return candidate
-    raise UserError(f"{folder} has poses, but no photos.", f"Put them into {folder / 'images'}.")
+    candidates = [path for path in (folder, folder / "images", *smaller) if path.is_dir()]
+    counts = [
+        sum(path.suffix.lower() in PHOTO_SUFFIXES for path in candidate.iterdir())
+        for candidate in candidates
+    ]
+    if not any(counts):
+        raise UserError(
+            f"{folder} has poses, but no photos.", f"Put them into {folder / 'images'}."
+        )
+    return candidates[counts.index(max(counts))]
 
 
 def _files(photos: dict[str, Path]) -> list[Path]:
@@ -193,7 +205,17 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
         if (source / TRUTH).is_dir():
-            shutil.copytree(source / TRUTH, fresh / TRUTH)
+            _copy_folder(source / TRUTH, fresh / TRUTH)
+
+
+def _copy_folder(source: Path, target: Path) -> None:
+    try:
+        shutil.copytree(source, target)
+    except shutil.Error as error:  # of all files that failed, the paths and why
+        where, _, why = error.args[0][0]
+        raise UserError(
+            f"{where} cannot be copied ({why}).", f"Correct it, or move {source} away."
+        ) from None
 
 
 def refuse_outside(folder: Path, capture: Capture) -> None:
@@ -217,4 +239,6 @@ def _belonging(source: Path, capture: Capture) -> list[Path]:
     files |= {source / name for name in (TRANSFORMS, POSES_BOUNDS, RAIN_MASK)}
     if capture.model:
         files |= {path for path in capture.model.iterdir() if path.suffix in (".bin", ".txt")}
+    if lost := sorted(path for path in capture.photos.values() if not path.exists()):
+        raise UserError(f"{lost[0]} is a link to nowhere.", "Copy the photo there, or remove it.")
     return sorted(path for path in files if path.is_file())

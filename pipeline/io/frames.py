@@ -20,6 +20,7 @@ GLANCE_PX = 160  # longest side of the small picture in which motion is measured
 LOOK_PX = 480  # longest side of the picture in which sharpness is measured
 SHORT, SHORT_SECONDS = 0.05, 0.5  # share of a video, and seconds, that may be missing at its end
 STILL_PX = 0.05  # less motion than this between two small pictures is noise
+SQUARE, WIDEST = 0.005, 4  # pixels nearer to squares than this are squares; wider ones are a slip
 MIDDLE = 0.6  # share of its stretch of the way in which a frame is looked for
 
 
@@ -71,7 +72,8 @@ def pick_frames(path: Path, count: int) -> Picked:
         glance = _grey(frame, GLANCE_PX)
         motion.append(0.0 if last is None else _median_flow(last, glance))
         sharpness.append(float(cv2.Laplacian(_grey(frame, LOOK_PX), cv2.CV_32F).var()))
-        frames.append(Frame(index, round(float(frame.time or 0.0), 3), frame.rotation % 360))
+        turned = round(frame.rotation / 90) * 90 % 360
+        frames.append(Frame(index, round(float(frame.time or 0.0), 3), turned))
         last = glance
     if not frames:
         raise UserError(
@@ -120,6 +122,7 @@ def save_frames(
 ) -> tuple[list[ImageRecord], list[str]]:
     """Writes at most `count` frames of the video into `folder`, no side above `longest_side` (0: any).
 
+    Pixels that are shown wider than high become squares: poses are found with one focal length.
     Returns their records (`source` tells the video and the time, the checksum is the video's) and what
     the user should hear, as sentences. UserError when there are fewer than `at_least`.
     """
@@ -131,8 +134,11 @@ def save_frames(
             "Film for longer, walking; 20 to 60 seconds are plenty.",
         )
     records: list[ImageRecord] = []
+    wide = _pixel_width(path)
     for frame, pixels in read_frames(path, chosen):
-        size = final_size((pixels.shape[1], pixels.shape[0]), longest_side)
+        across, down = (1.0, wide) if frame.upright_turn % 180 else (wide, 1.0)
+        shown = (round(pixels.shape[1] * across), round(pixels.shape[0] * down))
+        size = final_size(shown, longest_side)
         name = f"frame_{len(records):04d}.png"
         write_image(folder / name, resized(pixels, size))
         source = f"{path.name} at {frame.seconds:.3f} s"
@@ -141,7 +147,7 @@ def save_frames(
 
 
 def _decoded(path: Path) -> Iterator[av.VideoFrame]:
-    shown = None
+    shown, size = None, None
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
@@ -149,12 +155,28 @@ def _decoded(path: Path) -> Iterator[av.VideoFrame]:
             container.streams.video[0].thread_type = "AUTO"
             for frame in container.decode(container.streams.video[0]):
                 shown = float(frame.time or 0.0)
+                size = size or (frame.width, frame.height)
+                if (frame.width, frame.height) != size:
+                    raise UserError(
+                        f"{path} changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} "
+                        f"pixels after {shown:.1f} s.",
+                        "Convert it to one size, or save frames of one size as photos.",
+                    )
                 yield frame
-    except av.FFmpegError as error:
-        told = f"{path} is not a video that can be read ({error.strerror})."
+    except (av.FFmpegError, UnicodeDecodeError) as error:  # the latter: names in a damaged header
+        why = getattr(error, "strerror", None) or "its header is damaged"
+        told = f"{path} is not a video that can be read ({why})."
         if shown is not None:
-            told = f"{path} is damaged after {shown:.1f} s ({error.strerror})."
+            told = f"{path} is damaged after {shown:.1f} s ({why})."
         raise UserError(told, "Copy it again, or convert it to MP4.") from None
+
+
+def _pixel_width(path: Path) -> float:
+    """How wide a pixel is shown, in heights: 4/3 of much tape and of some cameras' cards, mostly 1."""
+    with av.open(str(path)) as container:
+        ratio = float(container.streams.video[0].sample_aspect_ratio or 1.0)
+    square = abs(ratio - 1) < SQUARE or not 1 / WIDEST <= ratio <= WIDEST
+    return 1.0 if square else ratio
 
 
 def _told_seconds(path: Path) -> float:

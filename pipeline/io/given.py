@@ -54,8 +54,8 @@ class GivenView:
         """Whether the project's own camera, one radial term, says the same without resampling."""
         if self.fisheye or any(self.distortion[1:]):
             return False
-        corner = (0.5 * self.width / self.fx) ** 2 + (0.5 * self.height / self.fy) ** 2
-        return not self.distortion or abs(self.distortion[0]) * corner <= MOST_BENT
+        x, y = 0.5 * self.width / self.fx, 0.5 * self.height / self.fy
+        return not self.distortion or abs(self.distortion[0]) * (x * x + y * y) <= MOST_BENT
 
     def turn_for(self, stored: tuple[int, int], upright_turn: int) -> int | None:
         """Degrees ccw by which the stored pixels (w, h) become those of this camera; None: neither way."""

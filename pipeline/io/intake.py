@@ -78,8 +78,11 @@ def photo_records(
     for name in sorted(plan.turns):
         source = capture.photos[name].relative_to(folder).as_posix()
         record = photos[name].record(name, source, plan.turns[name], size)
-        lens = lens_of(straighten[name]) if name in straighten else None
-        records.append(replace(record, lens=lens))
+        if name in straighten:  # the metadata tells of the lens as it was
+            straight = straighten[name].straight
+            focal_px = round(straight.fx * size[0] / straight.width, 3)
+            record = replace(record, lens=lens_of(straighten[name]), focal_px=focal_px)
+        records.append(record)
     return records
 
 
@@ -145,11 +148,20 @@ def _turned_as_its_photo(
     )
 
 
-def masks_said(masked: str, share: float) -> list[str]:
-    """What the user should hear of masks that came along, which drop `share` of the pixels."""
+def masks_said(masked: str, share: float | None, photos: Mapping[str, Photo]) -> list[str]:
+    """What the user should hear of masks that came along, which drop `share` of the pixels; None: no masks."""
+    if share is None:
+        return []
     said = [f"masks came along ({masked}): {100 * share:.1f} % of the pixels are dropped"]
     if share > SUSPECT:
         said.append(
             "the masks drop most of the photos: are they upside down? black is dropped here"
+        )
+    turned = [photo for photo in photos.values() if photo.upright_turn]
+    unsure = sum(photo.ratio_after(0) == photo.ratio_after(photo.upright_turn) for photo in turned)
+    if unsure:
+        said.append(
+            f"the metadata turns {unsure} photos so that their masks' shape does not tell whether these are "
+            "turned too: they are taken as drawn over the photos as stored"
         )
     return said

@@ -15,6 +15,9 @@ import numpy as np
 from pipeline.errors import UserError
 from pipeline.io.atomic import read_npy, write_bytes
 
+# Of values up to the first number, those from the second up are kept; 0.5 too serves masks in floats.
+_MIDDLES = ((1, 0.5), (255, 128))
+
 
 def write_keep_mask(path: Path, keep_mask: np.ndarray) -> None:
     """Writes an (H, W) boolean keep mask (True = use) as a PNG of 255 and 0."""
@@ -35,7 +38,7 @@ def read_keep_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarra
     maker = "refine" if path.parent.name == "refine" else "masks"
     if not path.is_file():
         raise UserError(f"{path} does not exist.", f"Run `python -m stages.{maker}` first.")
-    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    values = _decoded(path)
     if values is None:
         raise UserError(
             f"{path} is not a readable image.", f"Run `python -m stages.{maker}` again."
@@ -56,13 +59,22 @@ def read_keep_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarra
     return values == 255
 
 
+def _decoded(path: Path) -> np.ndarray | None:
+    """The stored values of a picture; None when it cannot be read."""
+    try:
+        return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # more pixels than OpenCV takes, if the file's header tells the truth
+        return None
+
+
 def read_foreign_mask(path: Path) -> np.ndarray:
     """An (H, W) boolean keep mask (True = use) from another program's mask picture.
 
-    Black is dropped: 8-bit values from 128 up are kept; in a file of 0 and 1, the ones. Colour and
-    alpha are ignored where all channels agree. UserError when unreadable or coloured.
+    Black is dropped: values from 128 up are kept; in a file of 0 to 1 those from 0.5 up, in one that goes
+    beyond 255 those from 32768 up. Colour and alpha are ignored where all channels agree. UserError when
+    unreadable or coloured.
     """
-    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    values = _decoded(path)
     if values is None:
         raise UserError(f"{path} is not a readable image.", "Save the mask as 8-bit grey PNG.")
     if values.ndim == 3:
@@ -70,8 +82,9 @@ def read_foreign_mask(path: Path) -> np.ndarray:
         if (colours != colours[..., :1]).any():
             raise UserError(f"{path} is coloured; a mask is black and white.", "Save it as grey.")
         values = colours[..., 0]
-    top = int(values.max())
-    return values >= (1 if top <= 1 else 128 if values.dtype == np.uint8 else 32768)
+    top = float(values.max())
+    middle = next((half for most, half in _MIDDLES if top <= most), 32768)
+    return values >= middle
 
 
 def rain_mask(keep_masks: Sequence[np.ndarray]) -> np.ndarray:

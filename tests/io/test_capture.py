@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from pipeline.io.given import (
     read_nerfstudio,
     straightened,
 )
+from pipeline.io.intake import given_masks
 from pipeline.io.llff import read_poses_bounds
 from pipeline.io.masks import fit_mask, rain_mask, read_foreign_mask, read_rain_mask
 
@@ -371,3 +374,87 @@ def test_adopting_what_cannot_be_used_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no folder and no video"):
         adopt(source / "transforms.json", data, 3, _no_colmap)
     assert not data.exists()
+
+
+def test_a_video_beside_poses_is_not_taken_for_the_scene(tmp_path: Path) -> None:
+    """Poses are those of photos: which of the two is meant, the user says."""
+    _photos(tmp_path / "images")
+    _write(tmp_path, _transforms(tmp_path))
+    (tmp_path / "walk.mp4").touch()
+    with pytest.raises(UserError, match=r"holds walk\.mp4 and transforms\.json"):
+        _find(tmp_path)
+    (tmp_path / "transforms.json").unlink()
+    for part in ("cameras", "images", "points3D"):
+        (tmp_path / "sparse/0").mkdir(parents=True, exist_ok=True)
+        (tmp_path / f"sparse/0/{part}.bin").touch()
+    with pytest.raises(UserError, match=r"holds walk\.mp4 and cameras\.bin"):
+        _find(tmp_path)
+
+
+def test_a_stray_picture_above_the_photos_is_not_the_capture(tmp_path: Path) -> None:
+    for folder in ("images_8", "images", "images_4"):
+        _photos(tmp_path / folder)
+    np.save(tmp_path / "poses_bounds.npy", np.stack([_llff_row(x, 30, 40, 50) for x in range(3)]))
+    Image.new("RGB", (40, 30)).save(tmp_path / "overview.png")
+    found = _find(tmp_path)
+    assert {path.parent.name for path in found.photos.values()} == {"images"}
+    assert len(found.views) == 3
+
+
+def test_masks_that_the_poses_name_go_before_all_others(tmp_path: Path) -> None:
+    _photos(tmp_path / "images", (80, 60))
+    content = _transforms(tmp_path)
+    for frame in content["frames"]:
+        frame["mask_path"] = f"{frame['file_path']}.mask.png"
+        Image.new("L", (80, 60), 255).save(tmp_path / frame["mask_path"])
+    _write(tmp_path, content)
+    np.save(tmp_path / "rainMask.npy", np.ones((60, 80, 3), np.uint8))
+    capture = _find(tmp_path)
+    assert capture.masked_by == "mask pictures" and len(capture.masks) == 3
+    assert all(keep_mask.all() for _, keep_mask in given_masks(capture)), "not rainMask's drops"
+
+
+@pytest.mark.parametrize("place", ["photo", "truth"])
+def test_links_to_nowhere_are_not_left_out_of_a_copy(tmp_path: Path, place: str) -> None:
+    source, data = tmp_path / "capture", tmp_path / "data/garden"
+    _photos(source)
+    link = source / ("d.jpg" if place == "photo" else "truth/clean/a.png")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to("/absent")
+    with pytest.raises(UserError, match=re.escape(str(link))):
+        adopt(source, data, 3, _no_colmap)
+    assert not data.exists() and [path.name for path in data.parent.glob(".*")] == []
+
+
+def test_archives_and_headers_that_lie_are_no_arrays(tmp_path: Path) -> None:
+    np.savez(tmp_path / "several.npz", a=np.zeros(3))
+    several = (tmp_path / "several.npz").read_bytes()
+    array, vast = tmp_path / "p.npy", io.BytesIO()
+    told = {"descr": "<f8", "fortran_order": False, "shape": (10**13, 17)}
+    np.lib.format.write_array_header_1_0(vast, told)
+    for content in (several, several[:100], b"PK\x03\x04", b"", vast.getvalue()):
+        array.write_bytes(content)
+        with pytest.raises(UserError, match=r"p\.npy is not a readable array"):
+            read_poses_bounds(array, [])
+
+
+@pytest.mark.parametrize(
+    ("values", "kept"),
+    [
+        (np.array([[0, 255]], np.uint16), [[False, True]]),
+        (np.array([[0.0, 0.4, 0.6, 1.0]], np.float32), [[False, False, True, True]]),
+        (np.array([[0.0, 255.0]], np.float32), [[False, True]]),
+    ],
+)
+def test_masks_of_wider_numbers_than_their_values_need(
+    tmp_path: Path, values: np.ndarray, kept: list[list[bool]]
+) -> None:
+    """8-bit values in 16 bits, floats: their range tells, not their type."""
+    cv2.imwrite(str(tmp_path / "m.tiff"), values)
+    assert read_foreign_mask(tmp_path / "m.tiff").tolist() == kept
+
+
+def test_a_focal_length_of_nothing_is_no_defect(tmp_path: Path) -> None:
+    _photos(tmp_path / "images")
+    path = _write(tmp_path, _transforms(tmp_path, fl_x=1e-200, fl_y=1e-200, k1=0.1))
+    assert not read_nerfstudio(path)[0].carried

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -124,3 +125,37 @@ def test_an_mp4_that_broke_off_is_told_or_refused_with_the_second(
     assert re.search(
         r"cut\.mp4 is damaged after [1-3]\.\d s|its pictures end after [1-3]\.\d s", said
     )
+
+
+def _encoded(path: Path, frames: list[np.ndarray], shape: tuple[int, int] = (1, 1)) -> Path:
+    """A video whose pixels are shown as `shape` (width, height) says."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(*shape)
+        for frame in frames:
+            pixels = np.ascontiguousarray((255 * frame).astype(np.uint8))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def test_pixels_that_are_shown_wide_become_squares(tmp_path: Path) -> None:
+    """Tape's 1440x1080 are shown as 1920x1080: one focal length serves both directions only then."""
+    frames = _pan()[1]
+    for shape, size in (((4, 3), (427, 240)), ((1, 1), (320, 240)), ((1000, 1001), (320, 240))):
+        video = _encoded(tmp_path / "wide.mp4", frames, shape)
+        records, _ = save_frames(video, tmp_path, 3, 0)
+        assert {record.size for record in records} == {size}
+        assert image_size(tmp_path / records[0].name) == size
+
+
+def test_a_video_that_changes_its_size_is_refused(tmp_path: Path) -> None:
+    """As recordings of calls do; images are of one size."""
+    frames = _pan()[1]
+    large = _encoded(tmp_path / "a.ts", frames[:40]).read_bytes()
+    small = _encoded(tmp_path / "b.ts", [frame[::2, ::2] for frame in frames[40:]]).read_bytes()
+    (tmp_path / "call.ts").write_bytes(large + small)
+    with pytest.raises(UserError, match=r"call\.ts changes from 320x240 to 160x120 pixels after"):
+        pick_frames(tmp_path / "call.ts", 5)

@@ -134,6 +134,19 @@ def test_masks_that_drop_most_raise_a_doubt(tmp_path: Path) -> None:
     assert any("upside down" in said for said in read_origin(_ingest(tmp_path)).said)
 
 
+@pytest.mark.parametrize(("orientation", "told"), [(1, False), (6, False), (3, True)])
+def test_masks_of_photos_taken_upside_down_are_told_to_be_unsure(
+    tmp_path: Path, orientation: int, told: bool
+) -> None:
+    """Stored or shown, a mask turned by half has its photo's shape; a quarter would be seen."""
+    for name in "abc":
+        _photo(tmp_path / f"data/made/{name}.jpg", orientation=orientation)
+        (tmp_path / "data/made/masks").mkdir(exist_ok=True)
+        Image.new("L", (40, 30), 255).save(tmp_path / f"data/made/masks/{name}.png")
+    said = read_origin(_ingest(tmp_path)).said
+    assert any("the metadata turns 3 photos" in sentence for sentence in said) == told
+
+
 def test_a_video_becomes_images(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     wide = cv2.resize(rng.random((20, 60, 3)).astype(np.float32), (600, 200)).clip(0, 1)
