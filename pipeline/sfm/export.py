@@ -18,7 +18,7 @@ def read_sparse(folder: Path) -> pycolmap.Reconstruction:
     """The model that the stage `poses` wrote; UserError when missing or damaged."""
     try:
         return pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, IndexError, KeyError) as error:
+    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
         raise UserError(
             f"{folder} is not a readable COLMAP model ({error}).",
             "Run `python -m stages.poses` again.",

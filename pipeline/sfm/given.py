@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import zlib  # noqa: F401  before pycolmap, see the package
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -51,9 +52,15 @@ def read_colmap(folder: Path, photos: Sequence[Path]) -> list[GivenView]:
     """
     try:
         model = pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, IndexError, KeyError) as error:
+    except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
         raise UserError(f"{folder} is not a readable COLMAP model ({error}).") from None
     by_name = {photo.name: photo for photo in photos}
+    called = Counter(Path(image.name).name for image in model.images.values())
+    if twice := sorted(name for name in by_name if called[name] > 1):
+        raise UserError(
+            f"{folder} holds {called[twice[0]]} images called {twice[0]}, in different folders.",
+            "Photos are found by their file names: give each a name of its own, in the model too.",
+        )
     views = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         photo = by_name.get(Path(image.name).name)
@@ -114,6 +121,7 @@ def triangulate(
     """
     names, settings = sorted(names), replace(settings, camera="per_image")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
+    given = _of_these(given, sizes, image_dir)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     work_dir.mkdir(parents=True, exist_ok=True)
     report = progress if progress is not None else silent
@@ -143,6 +151,21 @@ def triangulate(
         settings=settings,
         model=model,
     )
+
+
+def _of_these(
+    given: Mapping[str, View], sizes: Mapping[str, tuple[int, int]], image_dir: Path
+) -> dict[str, View]:
+    """The views that belong to images, whose sizes are told; UserError for none, or of another size."""
+    found = {name: view for name, view in given.items() if name in sizes}
+    odd = [name for name, view in found.items() if (view.width, view.height) != sizes[name]]
+    if odd or not found:
+        told = f"that of {min(odd)} is for another size" if odd else "none is for one of them"
+        raise UserError(
+            f"the poses that came with the photos in {image_dir} do not fit them: {told}.",
+            "Run `python -m stages.ingest` again, or set poses.use_given: false.",
+        )
+    return found
 
 
 def _with_points(

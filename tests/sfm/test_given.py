@@ -154,6 +154,27 @@ def test_camera_models_keep_their_meaning(scene, tmp_path):
         read_colmap(tmp_path, photos)
 
 
+def test_two_images_of_one_name_are_not_guessed_between(scene, tmp_path):
+    """Two cameras of a rig name their pictures alike; the photos lie in one folder."""
+    model = _model(tmp_path, scene, "PINHOLE", [FOCAL, FOCAL, 120.0, 90.0])
+    twin = pycolmap.Image(name="other/v1.png", camera_id=1, image_id=99)
+    model.add_image_with_trivial_frame(twin, pycolmap.Rigid3d())
+    model.write_binary(str(tmp_path))
+    photos = [scene.images / name for name in scene.names]
+    with pytest.raises(UserError, match=r"2 images called v1\.png"):
+        read_colmap(tmp_path, photos)
+    assert read_colmap(tmp_path, photos[:1]), "v1 is not asked for"
+
+
+def test_given_poses_of_no_image_and_of_another_size_are_refused(scene, tmp_path):
+    views = true_views(scene)
+    with pytest.raises(UserError, match="none is for one of them"):
+        pass_on(scene, {"other.png": views["v0.png"]}, tmp_path)
+    views["v1.png"] = dataclasses.replace(views["v1.png"], width=2 * WIDTH)
+    with pytest.raises(UserError, match=r"that of v1\.png is for another size"):
+        pass_on(scene, views, tmp_path)
+
+
 def test_a_model_of_other_photos_and_a_damaged_one_are_refused(scene, tmp_path):
     _model(tmp_path, scene, "PINHOLE", [FOCAL, FOCAL, 120.0, 90.0]).write_binary(str(tmp_path))
     write_image(tmp_path / "other.png", np.zeros((HEIGHT, WIDTH, 3)))
