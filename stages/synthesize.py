@@ -85,8 +85,7 @@ def _painted_in_the_scene(job: Job, params: Params, work: Path) -> None:
     capture = find_capture(folder, 2, read_colmap)
     recipe = params.model_dump(mode="json")
     photos, on_pane = posed.plan(recipe, capture, folder)
-    dry = len(capture.photos) - len(photos)
-    if dry:
+    if dry := len(capture.photos) - len(photos):
         log.warning("%s photos without a pose are left out", dry)
     items = {
         stem: (recipe, k, photos[stem], on_pane, work) for k, stem in enumerate(sorted(photos))
@@ -107,6 +106,7 @@ def main(job: Job, params: Params) -> str:
     work = job.paths.work("synthesize") / key
     make = _rendered
     if params.mode == "paint":
+        shutil.rmtree(work, ignore_errors=True)  # what an interrupted run made of photos now gone
         make = _painted if params.paint_pane == "lens" else _painted_in_the_scene
     make(job, params, work)
     write_json(work / MARKER, recipe)

@@ -35,7 +35,11 @@ def _graph() -> Any:
 
 def true_code_dependencies(stage: str) -> set[str]:
     """The rooms that a stage imports, directly or not; `io`, which all share, file by file."""
-    modules = _graph().find_upstream_modules(f"stages.{stage}") - RUNNER
+    return _code(f"stages.{stage}")
+
+
+def _code(module: str) -> set[str]:
+    modules = _graph().find_upstream_modules(module) - RUNNER
     paths = set()
     for module in modules:
         parts = module.split(".")
@@ -68,6 +72,19 @@ def test_dvc_lists_the_parameters_that_a_stage_reads(name: str) -> None:
     if "--variant" in entry["cmd"]:
         expected.add("variants.${item.variant}")
     assert set(entry["params"]) == expected
+
+
+def test_the_wet_scenes_follow_the_code_that_renders_them() -> None:
+    """`synthesize` can do more, paint on photos that lie anywhere; these scenes are ray traced."""
+    content = yaml.safe_load((ROOT / "experiments/scenes/dvc.yaml").read_text())
+    deps = {dep.removeprefix("../../") for dep in content["stages"]["scene"]["do"]["deps"]}
+    assert {"stages/synthesize.py", "pipeline/drops", *_code("pipeline.drops.storing")} <= deps
+
+
+def test_the_page_follows_the_numbers_that_it_shows() -> None:
+    """metrics.json tells what no image has: the poses, and how the numbers were taken."""
+    deps = _stages()["report"]["deps"]
+    assert {"artifacts/${key}/metrics.json", "artifacts/${key}/poses"} <= set(deps)
 
 
 def test_a_stage_says_in_one_sentence_what_it_does() -> None:

@@ -232,6 +232,23 @@ def test_paint_wets_all_photos_with_the_same_drops(tmp_path: Path) -> None:
     assert (data / "0.jpg").read_bytes() == first
 
 
+def test_what_an_interrupted_run_painted_of_a_photo_now_gone_does_not_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos(tmp_path)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(synthesize, "publish_dir", interrupted)
+        synthesize.main(job(tmp_path), synthesize.Params(**RECIPE))
+    (tmp_path / "clean/1.png").unlink()
+    synthesize.main(job(tmp_path), synthesize.Params(**RECIPE))
+    made = {path.stem for path in (tmp_path / "data/wet").rglob("*.*") if path.stem in "01"}
+    assert made == {"0"}
+
+
 def test_folders_of_others_are_refused_and_left_alone(tmp_path: Path) -> None:
     photos(tmp_path)
     (tmp_path / "data/wet").mkdir(parents=True)
