@@ -58,7 +58,7 @@ def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         content = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}).", "Check the file.") from None
-    except (YAMLError, UnicodeDecodeError) as error:
+    except (YAMLError, ValueError, RecursionError) as error:  # no text, no such date, too deep
         raise UserError(f"{file} is not valid YAML{_place(error)}.", CORRECT) from None
     content = _mapping(file, "the file", content)
     known = (*stage_names(), *OTHER_SECTIONS, BASE)
@@ -84,7 +84,7 @@ def _upon(file: Path, below: dict[str, Any], above: Mapping[str, Any]) -> dict[s
     for section, values in above.items():
         if section != BASE:
             own = _mapping(file, section, values or {})
-            merged[section] = {**(below.get(section) or {}), **own}
+            merged[section] = {**_mapping(file, section, below.get(section) or {}), **own}
     return merged
 
 

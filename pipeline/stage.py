@@ -69,7 +69,10 @@ class Job:
 
     def resolve(self, path: str) -> Path:
         """`path` from params.yaml: absolute, or relative to the folder of params.yaml."""
-        return self.root / Path(path).expanduser()
+        try:
+            return self.root / Path(path).expanduser()
+        except RuntimeError:
+            raise UserError(f"{path}: there is no such home folder.", "Write it out.") from None
 
 
 class _AboveProgressBars(logging.Handler):

@@ -19,7 +19,7 @@ from pipeline.io.scene import read_images_json
 from pipeline.stage import Job, Section, run
 from pipeline.tables import compose
 from pipeline.tables.crops import busiest_window, side_by_side
-from pipeline.tables.reading import gathered_scores, mask_scores, view_scores
+from pipeline.tables.reading import gathered_scores, mask_scores, read_view_scores
 from pipeline.tables.rows import ROWS, Row
 from pipeline.tables.writers import as_csv, latex, markdown
 
@@ -54,7 +54,7 @@ def main(job: Job, params: Params) -> str:
                     continue
                 metrics = read_metrics(paths.metrics)
                 poses[scene], conventions = metrics["poses"], metrics["conventions"]
-                scores = view_scores(paths.metrics_csv.read_text(encoding="utf-8"), row)
+                scores = read_view_scores(paths.metrics_csv, row)
                 if row.id in ("unaveraged", "derain", "loop"):
                     scores |= mask_scores(metrics)
                 for name, value in scores.items():

@@ -77,6 +77,8 @@ def test_every_problem_is_told_at_once_with_the_nearest_name(tmp_path: Path) -> 
         (GOOD.replace("threshold: 3e-1", "threshold: .nan"), "masks.threshold"),
         ("scenes: {demo: {}}", "the section masks is missing"),
         ("scenes: {demo: {}}\nmasks: 3", "key: value"),
+        ("masks: {threshold: 2026-99-99}", "not valid YAML: month must be"),
+        ("[" * 20_000, "not valid YAML"),
     ],
 )
 def test_faults_of_the_file_are_sentences(tmp_path: Path, text: str, sentence: str) -> None:
@@ -172,6 +174,13 @@ def test_a_file_may_build_on_another(tmp_path: Path) -> None:
         read_params(above)
     above.write_text("base: params.yaml\n")
     with pytest.raises(UserError, match="builds on itself"):
+        read_params(above)
+
+
+def test_a_base_with_a_list_for_a_section_is_told(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("masks: [1, 2]\n")
+    above = _file(tmp_path, "base: base.yaml\nmasks: {dilation: 1}\n")
+    with pytest.raises(UserError, match="masks should hold key: value pairs"):
         read_params(above)
 
 

@@ -35,8 +35,10 @@ def read_true_cameras(
             _key(stem): np.asarray(frame["cam_from_world"], np.float64).reshape(4, 4)
             for stem, frame in content["frames"].items()
         }
+        if odd := [stem for stem, pose in frames.items() if not np.isfinite(pose).all()]:
+            raise ValueError(f"{odd[0]} has a pose that is not finite")
         unit = str(content.get("unit", "units of the true cameras"))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(
             f"{path} is not a list of true cameras ({error!r}).", "Restore the file."
         ) from None

@@ -56,7 +56,7 @@ def read_reference(path: Path, record: ImageRecord, source: Path) -> np.ndarray:
         pixels = straightener(record.lens)(pixels)
     height, width = pixels.shape[:2]
     if (width, height) != record.size:
-        photo = sorted(image_size(source)) if source.is_file() else []
+        photo = sorted(_size_of(source))
         if sorted((width, height)) != photo or (width > height) != (record.width > record.height):
             raise UserError(
                 f"{path} is {width}x{height}, its image is {record.width}x{record.height}.",
@@ -64,3 +64,11 @@ def read_reference(path: Path, record: ImageRecord, source: Path) -> np.ndarray:
             )
         pixels = cv2.resize(pixels, record.size, interpolation=cv2.INTER_AREA)
     return pixels.astype(np.float32) / np.float32(255)
+
+
+def _size_of(source: Path) -> tuple[int, ...]:
+    """(width, height) of a photo as it was taken; nothing when that cannot be told any more."""
+    try:
+        return image_size(source)
+    except OSError:
+        return ()

@@ -159,15 +159,35 @@ def describe(field: GridField | PaperField) -> dict[str, Any]:
     return {"model": name, "config": asdict(field.config), "space": field.space.to_json()}
 
 
+def _checked(space: Space) -> Space:
+    """``space`` itself; ValueError when its numbers bound nothing."""
+    rows, sides = space.ref_from_world, list(zip(space.low, space.high, strict=True))
+    if space.kind not in ("ndc", "contract") or [len(row) for row in rows] != [4] * 3:
+        raise ValueError("its space is of no known kind")
+    numbers = np.array([space.near, *space.low, *space.high, *(v for row in rows for v in row)])
+    if not np.isfinite(numbers).all() or space.near <= 0:
+        raise ValueError("its space has no bounds")
+    if len(sides) != 3 or not all(low < high for low, high in sides):
+        raise ValueError("its space holds nothing")
+    return space
+
+
 def restore(
     description: Mapping[str, Any], tensors: Mapping[str, np.ndarray]
 ) -> GridField | PaperField:
     """The field that :func:`describe` described, with its fitted tensors."""
     try:
-        space = Space.from_json(description["space"])
+        space = _checked(Space.from_json(description["space"]))
         field = build(description["model"], description["config"], space, 0)
         field.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in tensors.items()})
-    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        RuntimeError,
+    ) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise UserError(
             f"The fitted field cannot be read back: {reason}.",

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,7 +61,9 @@ def _load_field(folder: Path, device: str, written: int) -> Fitted:
     field = restore(about, tensors).to(device)
     try:
         near, far = (float(about["bounds"][name]) for name in ("near", "far"))
-    except (KeyError, TypeError, ValueError) as error:
+        if not 0 < near < far < math.inf:
+            raise ValueError(f"{near} to {far}")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{folder / 'field.json'} tells no depths ({error!r}).",
             "Run `python -m stages.nerf` again.",
@@ -109,10 +112,11 @@ class Checkpoint:
         except UserError as error:
             log.warning("%s The fit starts over.", error.what)
             return None
-        if about.get("key") != self.key:
+        step = str(about.get("step", ""))
+        if about.get("key") != self.key or not step.isdecimal():
             return None
         state = {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
-        return int(about["step"]), state
+        return int(step), state
 
     def remove(self) -> None:
         """The fit is done."""

@@ -35,6 +35,14 @@ class PhotoInfo:
     focal_px: float | None
 
 
+def _decoded(path: Path, how: int) -> np.ndarray | None:
+    """The pixels of a file as OpenCV reads them, BGR unless `how` says otherwise; None: it cannot."""
+    try:
+        return cv2.imread(str(path), how)
+    except cv2.error:  # more pixels than it takes, if the file's header tells the truth
+        return None
+
+
 def read_image(
     path: Path, made_by: str = "ingest", size: tuple[int, int] | None = None
 ) -> np.ndarray:
@@ -44,7 +52,7 @@ def read_image(
     """
     if not path.is_file():
         raise UserError(f"{path} does not exist.", f"Run `python -m stages.{made_by}` first.")
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    pixels = _decoded(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(
             f"{path} is not a readable image.", f"Run `python -m stages.{made_by}` again."
@@ -73,9 +81,15 @@ def write_image(path: Path, rgb: np.ndarray) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of the stored pixels, read from the file's header."""
-    with Image.open(path) as photo:
-        return photo.size
+    """(width, height) of the stored pixels, read from the file's header; OSError when it tells none."""
+    can_read(path.suffix.lower())  # registers what reads HEIC, once in every process
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as photo:
+                return photo.size
+    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise OSError(str(error)) from error
 
 
 @cache

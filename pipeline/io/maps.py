@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -33,12 +34,20 @@ def _write(
         raise OSError(out.geterror())
 
 
+def _told(by: Any) -> str:
+    """What the library says of its last failure: it quotes a damaged header, which may be no text."""
+    try:
+        return str(by.geterror())
+    except UnicodeDecodeError:
+        return "its header is damaged"
+
+
 def _read(path: Path, made_by: str) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path} does not exist.", f"Run `python -m stages.{made_by}` first.")
     file = oiio.ImageInput.open(str(path))
     pixels = file.read_image("float") if file is not None else None
-    problem = file.geterror() if file is not None else oiio.geterror()
+    problem = _told(file if file is not None else oiio)
     if pixels is None:
         raise UserError(
             f"{path} cannot be read ({problem}).", f"Run `python -m stages.{made_by}` again."

@@ -56,13 +56,24 @@ def read_posed_images(
 def posed_records(
     images: Path, views: Mapping[str, View], *, held_out_alone: bool = False
 ) -> list[ImageRecord]:
-    """The images that have a pose, or the held-out ones among them, in name order; UserError for none."""
+    """The images that have a pose, or the held-out ones among them, in name order.
+
+    UserError for none, or when a pose is for another size.
+    """
     records = [record for record in read_images_json(images) if record.name in views]
     if not records:
         raise UserError(
             f"no photo in {images} has a pose.",
             "Run `python -m stages.poses` again; poses/poses.json tells why photos were lost.",
         )
+    for record in records:
+        view = views[record.name]
+        if (view.width, view.height) != record.size:
+            raise UserError(
+                f"the pose of {record.name} is for {view.width}x{view.height} pixels; it has "
+                f"{record.width}x{record.height}.",
+                "Run `python -m stages.poses` again.",
+            )
     if held_out_alone:
         records = [record for record in records if record.split == "test"]
         if not records:

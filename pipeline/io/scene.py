@@ -17,6 +17,7 @@ GIVEN_POSES = "transforms.json"
 GIVEN_MASKS = "masks"
 # `mean.exr` among the attention maps belongs to the temporal mean.
 RESERVED_STEMS = frozenset({"mean"})
+LONGEST = 2**31  # a side in pixels that no picture reaches
 
 
 @dataclass(frozen=True)
@@ -112,16 +113,29 @@ def read_images_json(folder: Path) -> list[ImageRecord]:
     records = [_record(entry) for entry in _read(folder)["images"]]
     problem = "" if records else "it names none"
     for record in records:
-        if Path(record.name).name != record.name:
-            problem = f"{record.name!r} is no name of a file"
-        if min(record.size) <= 0:
-            problem = f"{record.name} has a size that is not in pixels"
+        problem = problem or _problem(record)
+    names = [record.name for record in records]
+    if twice := sorted(name for name in set(names) if names.count(name) > 1):
+        problem = f"it names {twice[0]} twice"
     if problem:
         raise UserError(
             f"{folder / FILE} is not a list of images ({problem}).",
             "Run `python -m stages.ingest` again.",
         )
     return sorted(records, key=lambda record: record.name)
+
+
+def _problem(record: ImageRecord) -> str:
+    """What cannot be true of an entry, or nothing."""
+    if Path(record.name).name != record.name:
+        return f"{record.name!r} is no name of a file"
+    if not all(0 < side <= LONGEST for side in record.size):
+        return f"{record.name} has a size that is not in pixels"
+    if record.focal_px is not None and record.focal_px <= 0:
+        return f"{record.name} has a focal length that is not positive"
+    if record.turned % 90:
+        return f"{record.name} is turned by {record.turned} degrees"
+    return ""
 
 
 def _read(folder: Path) -> dict[str, Any]:

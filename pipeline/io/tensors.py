@@ -33,8 +33,15 @@ def load_tensors(path: Path, hint: str = "") -> tuple[dict[str, np.ndarray], dic
         with safetensors.safe_open(str(path), framework="numpy") as file:
             header = file.metadata() or {}
             metadata = json.loads(header["metadata"]) if "metadata" in header else header
+            if not isinstance(metadata, dict):
+                raise ValueError("its metadata are no names with values")
             return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
+    except (safetensors.SafetensorError, OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path} is not a readable safetensors file ({error}).", hint.replace("first", "again")
+        ) from None
+    except (TypeError, AttributeError) as error:  # of a kind that NumPy has no name for
+        raise UserError(
+            f"{path} holds numbers of a kind that cannot be read ({error}).",
+            f"Convert them to float32. {hint.replace('first', 'again')}".strip(),
         ) from None

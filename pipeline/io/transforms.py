@@ -100,8 +100,10 @@ def read_transforms(path: Path) -> dict[str, View]:
             f"{path} is not a list of posed views ({error!r}).",
             "Run `python -m stages.poses` again.",
         ) from None
+    seen: set[str] = set()
     for view in views:
-        problem = _problem(view)
+        problem = "two poses" if view.name in seen else _problem(view)
+        seen.add(view.name)
         if problem:
             raise UserError(
                 f"{path}: {view.name} has {problem}.", "Run `python -m stages.poses` again."

@@ -34,17 +34,23 @@ def read_state(path: Path, hint: str = "") -> dict[str, Tensor]:
         state = _read_torch(path, hint)
     named = {name.removeprefix("module."): value for name, value in state.items()}
     return {
-        name: torch.as_tensor(value)
+        name: value if isinstance(value, Tensor) else _tensor(value)
         for name, value in named.items()
-        if isinstance(value, Tensor | np.ndarray)
+        if isinstance(value, Tensor)
+        or (isinstance(value, np.ndarray) and value.dtype.kind in "bfiu")
     }
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    """The numbers as a tensor, of whatever order their bytes are."""
+    return torch.as_tensor(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
 def _read_npz(path: Path, hint: str) -> Mapping[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # what a damaged archive raises has no common kind
         raise UserError(f"{path} is not an npz file of plain arrays ({error}).", hint) from None
 
 
@@ -87,10 +93,10 @@ def fill(
             problems.append(f"{rename(name)} is missing")
         elif given.shape != own.shape:
             problems.append(f"{rename(name)} is {tuple(given.shape)}, not {tuple(own.shape)}")
-        elif not bool(torch.isfinite(given).all()):
+        elif not bool(torch.isfinite(taking := given.to(own.dtype)).all()):
             problems.append(f"{rename(name)} holds numbers that are not finite")
         else:
-            taken[name] = given.to(own.dtype)
+            taken[name] = taking
     if problems:
         more = f"; and {len(problems) - 8} more" if len(problems) > 8 else ""
         raise UserError(

@@ -6,13 +6,26 @@ import csv
 import io
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from pipeline.errors import UserError
 from pipeline.tables.rows import Row
 from pipeline.tables.statistics import mean
 
 NUMBERS = ("psnr", "ssim", "flip", "lpips")
 MASKS = ("precision", "recall", "iou")
+
+
+def read_view_scores(path: Path, row: Row) -> dict[str, float]:
+    """`view_scores` of a metrics.csv; UserError when it is missing or damaged."""
+    try:
+        return view_scores(path.read_text(encoding="utf-8"), row)
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        raise UserError(
+            f"{path} is not a table of numbers by image ({error!r}).",
+            "Run `python -m stages.evaluate` again.",
+        ) from None
 
 
 def view_scores(text: str, row: Row) -> dict[str, float]:

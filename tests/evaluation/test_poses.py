@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -66,3 +68,8 @@ def test_damaged_truth_is_told(tmp_path):
     write_json(path, {"frames": {"a": {"cam_from_world": [1, 2]}}})
     with pytest.raises(UserError, match="not a list of true cameras"):
         read_true_cameras(path, [])
+    for odd in (float("nan"), 10**400):
+        frames = {"a": {"cam_from_world": [[odd] * 4] * 4}}
+        path.write_text(json.dumps({"frames": frames}))
+        with pytest.raises(UserError, match="not a list of true cameras"):
+            read_true_cameras(path, [])

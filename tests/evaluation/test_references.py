@@ -76,6 +76,14 @@ def test_a_reference_of_the_photos_size_is_scaled_like_the_photo(tmp_path):
     assert np.abs(read * 255 - blocks).max() <= 0.51
 
 
+@pytest.mark.parametrize("content", [b"", b"rain", b"\x89PNG\r\n\x1a\n"])
+def test_a_photo_that_cannot_be_read_any_more_is_no_defect(tmp_path, content):
+    write_image(tmp_path / "a.png", picture(16, 12))
+    (tmp_path / "photo.jpg").write_bytes(content)
+    with pytest.raises(UserError, match="its image is 8x6"):
+        read_reference(tmp_path / "a.png", record(8, 6), tmp_path / "photo.jpg")
+
+
 def test_a_reference_of_another_size_is_refused(tmp_path):
     write_image(tmp_path / "a.png", picture(16, 12))
     with pytest.raises(UserError, match="16x12, its image is 8x6"):

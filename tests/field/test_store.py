@@ -42,6 +42,30 @@ def test_a_saved_field_comes_back_and_a_newer_one_replaces_it(tmp_path: Path) ->
     assert json.loads((tmp_path / "field.json").read_text())["steps"] == 7
 
 
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        (("bounds", "near"), -1.0),
+        (("bounds", "far"), float("inf")),
+        (("space", "kind"), "round"),
+        (("space", "near"), 0),
+        (("space", "high"), [1.0, -1.0, 1.0]),
+        (("space", "low"), [-1.0, float("nan"), 0.0]),
+        (("space", "ref_from_world"), [[1.0, 0, 0]] * 3),
+        (("config", "fine"), [4]),
+        (("config", "fine"), [4.5, 4.5, 4.5]),
+    ],
+)
+def test_a_field_of_nowhere_is_told(tmp_path: Path, where: tuple[str, str], value: object) -> None:
+    """Told when it is read, not as a division by zero in the middle of a view."""
+    save_field(tmp_path, GridField(TINY, SPACE, 1), 1.0, 9.0, {})
+    about = json.loads((tmp_path / "field.json").read_text())
+    about[where[0]][where[1]] = value
+    (tmp_path / "field.json").write_text(json.dumps(about))
+    with pytest.raises(UserError, match=r"cannot be read back|tells no depths"):
+        load_field(tmp_path, "cpu")
+
+
 def test_a_missing_field_names_the_stage(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         load_field(tmp_path, "cpu")

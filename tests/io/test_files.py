@@ -1,24 +1,31 @@
 from __future__ import annotations
 
+import struct
 import time
+import zlib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import cv2
 import numpy as np
 import psutil
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from pipeline.errors import UserError
-from pipeline.io.images import read_image, write_image
+from pipeline.io.images import image_size, read_image, write_image
 from pipeline.io.maps import read_depth, read_map, write_depth, write_map
-from pipeline.io.masks import read_keep_mask, write_keep_mask
-from pipeline.io.posed import read_posed_images
-from pipeline.io.scene import ImageRecord, write_images_json
+from pipeline.io.masks import read_foreign_mask, read_keep_mask, write_keep_mask
+from pipeline.io.posed import posed_records, read_posed_images
+from pipeline.io.scene import ImageRecord, read_images_json, write_images_json
 from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.io.transforms import View, read_transforms, write_transforms
 from pipeline.io.video import write_video
+from pipeline.io.weights import fill, read_state
 
 
 @pytest.fixture
@@ -67,6 +74,15 @@ def test_a_damaged_map_is_refused(tmp_path: Path, rng: np.random.Generator) -> N
         read_map(tmp_path / "missing.exr")
     with pytest.raises(ValueError, match="NaN"):
         write_map(tmp_path / "nan.exr", np.full((2, 2), np.nan, np.float32))
+
+
+def test_a_map_whose_header_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The library quotes the header when it says what is wrong, and that is no UTF-8."""
+    path = tmp_path / "m.exr"
+    write_map(path, rng.random((9, 12)))
+    path.write_bytes(path.read_bytes().replace(b"chlist", b"\xffhlist"))
+    with pytest.raises(UserError, match=r"m\.exr cannot be read \(its header is damaged\)"):
+        read_map(path)
 
 
 def test_depth_keeps_single_precision(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -205,6 +221,86 @@ def test_more_pixels_than_a_fit_can_number_are_told(
     monkeypatch.setattr("pipeline.io.posed.free_memory", lambda: 2**60)
     record = ImageRecord("a.png", "a.png", "", 2**31 - 1 + over, 1, None, "train", 0)
     write_images_json(tmp_path, [record])
+    view = replace(_view("a.png"), width=record.width, height=1)
     told = r"2\.1 thousand million pixels" if over else r"a\.png does not exist"
     with pytest.raises(UserError, match=told):
-        read_posed_images(tmp_path, None, {"a.png": _view("a.png")})
+        read_posed_images(tmp_path, None, {"a.png": view})
+
+
+def test_weights_that_numpy_has_no_name_for_are_told(tmp_path: Path) -> None:
+    """Published weights are often in bfloat16."""
+    save_file({"a": torch.zeros(3, dtype=torch.bfloat16)}, tmp_path / "half.safetensors")
+    with pytest.raises(UserError, match=r"half\.safetensors holds numbers .* cannot be read"):
+        load_tensors(tmp_path / "half.safetensors")
+    save_file({"a": torch.zeros(3)}, tmp_path / "list.safetensors", {"metadata": "[1]"})
+    with pytest.raises(UserError, match="no names with values"):
+        load_tensors(tmp_path / "list.safetensors")
+
+
+def test_archives_of_weights(tmp_path: Path) -> None:
+    path = tmp_path / "w.npz"
+    big_endian = np.arange(3, dtype=">f4")
+    np.savez(path, a=big_endian, about=np.array(["made", "by", "hand"]))
+    state = read_state(path)
+    assert state.keys() == {"a"} and state["a"].tolist() == [0, 1, 2], "text is no weight"
+    for content in (path.read_bytes()[:60], b"PK\x03\x04", b""):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match="not an npz file"):
+            read_state(path)
+
+
+def test_weights_that_overflow_are_not_finite(tmp_path: Path) -> None:
+    network = torch.nn.Linear(1, 1)
+    state = {"weight": torch.full((1, 1), 1e300, dtype=torch.float64), "bias": torch.zeros(1)}
+    with pytest.raises(UserError, match="weight holds numbers that are not finite"):
+        fill(network, state, "w.npz")
+
+
+def test_a_picture_that_claims_too_many_pixels_is_told(tmp_path: Path) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    head = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    path = tmp_path / "huge.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IEND", b""))
+    for read in (read_image, read_keep_mask, read_foreign_mask):
+        with pytest.raises(UserError, match=r"huge\.png is not a readable image"):
+            read(path)
+    with pytest.raises(OSError, match="pixels"):
+        image_size(path)
+
+
+def test_two_poses_of_one_image_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "t.json"
+    write_transforms(path, [_view("a.png"), _view("a.png")])
+    with pytest.raises(UserError, match=r"a\.png has two poses"):
+        read_transforms(path)
+
+
+def test_poses_for_another_size_are_told_before_any_image_is_read(tmp_path: Path) -> None:
+    record = ImageRecord("a.png", "a.jpg", "0", 128, 96, None, "train", 0)
+    write_images_json(tmp_path, [record])
+    with pytest.raises(UserError, match=r"a\.png is for 64x48 pixels; it has 128x96"):
+        posed_records(tmp_path, {"a.png": _view("a.png")})
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"turned": 45}, "turned by 45 degrees"),
+        ({"focal_px": -3.0}, "focal length that is not positive"),
+        ({"width": 10**400}, "size that is not in pixels"),
+    ],
+)
+def test_entries_of_images_that_cannot_be(
+    tmp_path: Path, change: dict[str, Any], told: str
+) -> None:
+    record = replace(ImageRecord("a.png", "a.jpg", "0", 8, 6, None, "train", 0), **change)
+    write_images_json(tmp_path, [record])
+    with pytest.raises(UserError, match=told):
+        read_images_json(tmp_path)
+    write_images_json(tmp_path, [replace(record, turned=0, focal_px=None, width=8)] * 2)
+    with pytest.raises(UserError, match=r"it names a\.png twice"):
+        read_images_json(tmp_path)

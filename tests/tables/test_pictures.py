@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pipeline.errors import UserError
 from pipeline.io.scene import ImageRecord
 from pipeline.io.transforms import View
 from pipeline.tables import shrink
 from pipeline.tables.crops import GAP, LABEL_HEIGHT, busiest_window, side_by_side
-from pipeline.tables.reading import gathered_scores, mask_scores, view_scores
+from pipeline.tables.reading import gathered_scores, mask_scores, read_view_scores, view_scores
 from pipeline.tables.rows import Row
 
 
@@ -68,3 +71,12 @@ def test_mask_numbers() -> None:
     assert mask_scores(metrics) == {"iou": 0.5}
     assert gathered_scores(metrics) == {"iou": 0.25}
     assert gathered_scores({}) == {}
+
+
+@pytest.mark.parametrize("content", [None, b"rain\n1\n", b"split,test.psnr\ntest,wet\n", b"\xff"])
+def test_a_table_of_numbers_that_is_none_is_told(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "metrics.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics\.csv is not a table of numbers by image"):
+        read_view_scores(path, Row("x", "x"))
