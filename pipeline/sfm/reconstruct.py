@@ -12,7 +12,7 @@ from pathlib import Path
 import pycolmap
 
 from pipeline.errors import UserError
-from pipeline.io.images import image_size
+from pipeline.io.images import image_size, read_image
 from pipeline.io.masks import read_keep_mask
 from pipeline.sfm.database import Progress, build_database
 from pipeline.sfm.mapping import map_images
@@ -149,7 +149,10 @@ def check_inputs(
     for name in names:
         try:
             sizes[name] = image_size(image_dir / name)
-        except OSError:
+            read_image(
+                image_dir / name
+            )  # all of it: pycolmap sees no features in what is cut short
+        except (OSError, UserError):
             unreadable.append(name)
             continue
         if mask_dir is not None:

@@ -37,6 +37,7 @@ def _text(path: Path) -> None:
         ("attention", "images/images.json", "ingest"),
         ("attention", "images/view_2.png", "ingest"),
         ("masks", "attention/view_2.exr", "attention"),
+        ("poses", "images/view_2.png", "ingest"),
         ("poses", "masks/view_2.png", "masks"),
         ("nerf", "poses/transforms.json", "poses"),
         ("refine", "masks/view_2.png", "masks"),

@@ -213,8 +213,11 @@ def test_a_single_photo_is_refused(scene, tmp_path):
         solve(scene.images, scene.names[:1], tmp_path)
 
 
-def test_an_unreadable_image_is_named(scene, tmp_path):
-    (tmp_path / "bad.png").write_text("not a picture")
+@pytest.mark.parametrize("cut", [False, True])
+def test_an_unreadable_image_is_named(scene, tmp_path, cut):
+    """Of one that is cut short the header is whole, and pycolmap would find it blank."""
+    whole = (scene.images / "v1.png").read_bytes()
+    (tmp_path / "bad.png").write_bytes(whole[: len(whole) * 2 // 3] if cut else b"no picture")
     shutil.copy(scene.images / "v0.png", tmp_path / "v0.png")
     with pytest.raises(UserError, match=r"bad\.png"):
         solve(tmp_path, ["v0.png", "bad.png"], tmp_path / "w")
