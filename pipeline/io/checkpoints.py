@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +15,7 @@ import torch
 from pipeline.io.atomic import write_bytes
 
 Rows = list[list[float | str]]
+log = logging.getLogger(__name__)
 
 
 class Resumable(Protocol):
@@ -48,10 +50,18 @@ def save_checkpoint(path: Path, trainer: Resumable, rows: Rows) -> None:
 
 
 def load_checkpoint(path: Path, trainer: Resumable) -> Rows:
-    """Takes the trainer back to where it was saved; the curve's rows so far, none without a file."""
+    """Takes the trainer back to where it was saved; the curve's rows so far.
+
+    Without a file there are none, and the trainer stays as it is; a damaged one counts as none.
+    """
     if not path.is_file():
         return []
-    saved = torch.load(path, map_location="cpu", weights_only=True)
-    trainer.restore(saved["trainer"])
-    rows: Rows = saved["rows"]
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        state, rows = saved["trainer"], list(saved["rows"])
+    except Exception as error:  # what a damaged pickle raises has no common kind
+        told = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+        log.warning("%s cannot be read (%s); the training starts over.", path, told)
+        return []
+    trainer.restore(state)
     return rows

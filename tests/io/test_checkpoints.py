@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from pipeline.io.checkpoints import training_key
+from pipeline.io.checkpoints import load_checkpoint, save_checkpoint, training_key
 
 
 def test_a_training_is_named_by_what_it_starts_and_learns_from(tmp_path: Path) -> None:
@@ -30,3 +31,26 @@ def test_a_training_is_named_by_what_it_starts_and_learns_from(tmp_path: Path) -
     weights.unlink()
     seen.add(key())
     assert len(seen) == 5
+
+
+class _Counter:
+    """A training that counts its steps."""
+
+    done = 0
+
+    def state(self) -> dict[str, Any]:
+        return {"done": self.done}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.done = state["done"]
+
+
+def test_a_damaged_checkpoint_counts_as_none(tmp_path: Path) -> None:
+    file, trainer = tmp_path / "c.pt", _Counter()
+    trainer.done = 7
+    save_checkpoint(file, trainer, [["a", 1.0]])
+    whole = file.read_bytes()
+    assert load_checkpoint(file, again := _Counter()) == [["a", 1.0]] and again.done == 7
+    for content in (whole[: len(whole) // 2], b"", b"rain", whole.replace(b"trainer", b"drainer")):
+        file.write_bytes(content)
+        assert load_checkpoint(file, again := _Counter()) == [] and again.done == 0
