@@ -165,14 +165,18 @@ def aligned_poses(
         poses = each(field.aligned, tasks)
         field.place(poses)
         moves = [moved_px(landmarks, view, before[n], poses[n]) for n, view in views.items()]
-        log.info("alignment, round %d: points moved by %.3f px", number, np.mean(moves))
-        if np.mean(moves) < settled_px:
+        moved = float(np.mean(moves))
+        log.info("alignment, round %d: points moved by %.3f px", number, moved)
+        if moved < settled_px:
             break
     return poses
 
 
 def moved_px(points: np.ndarray, view: View, before: np.ndarray, after: np.ndarray) -> float:
-    """How far points (N, 3) move in the photo between two poses, mean over those before both; 0 for none."""
+    """How far points (N, 3) move in the photo between two poses, mean over those before both; 0 for none.
+
+    The lens's radial term, which bends the picture but hardly its motion, is left out.
+    """
     camera = intrinsic_matrix(view.fx, view.fy, view.cx, view.cy)
     (old, old_depth), (new, new_depth) = (project(points, pose, camera) for pose in (before, after))
     ahead = (old_depth > 0) & (new_depth > 0)

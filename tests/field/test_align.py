@@ -119,7 +119,7 @@ def test_cameras_that_are_all_off_come_nearer_to_the_truth() -> None:
 
     assert off(found) < 0.6 * off(told)
     assert set(found) == set(true)
-    # The first round moves the points by whole pixels, but not by as many as ten: it is the last then.
+    # The first round moves the points by less than ten pixels: it is the last then.
     one, settled = align(fits=(120,), settled_px=0.0), align(fits=(120, 60), settled_px=10.0)
     assert all(np.array_equal(settled[name], one[name]) for name in true)
     assert any(not np.array_equal(found[name], one[name]) for name in true)
