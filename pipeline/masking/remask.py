@@ -123,8 +123,8 @@ def opened(drop_mask: np.ndarray) -> np.ndarray:
 def without_holes(drop_mask: np.ndarray, largest: float = LARGEST_HOLE) -> np.ndarray:
     """`drop_mask` with its holes filled: clear regions enclosed by one drop.
 
-    A region larger than `largest` times the drop's own area is left clear: several drops that touch
-    may stand around dry glass.
+    A region larger than `largest` times the area of that drop, or of a larger one that stands in the
+    region, is left clear: several drops that touch may stand around dry glass.
     """
     drops, count = ndimage.label(drop_mask, np.ones((3, 3)))
     clear, holes = ndimage.label(~drop_mask)
@@ -132,12 +132,11 @@ def without_holes(drop_mask: np.ndarray, largest: float = LARGEST_HOLE) -> np.nd
         return drop_mask.copy()
     rim = np.unique(np.concatenate([clear[0], clear[-1], clear[:, 0], clear[:, -1]]))
     areas = np.bincount(drops.ravel())
+    areas[0] = 0
     sizes = np.bincount(clear.ravel())
-    # An enclosed region has one drop around it: the largest label in its neighbourhood is that.
-    around = ndimage.maximum(
-        cv2.dilate(drops.astype(np.float32), np.ones((3, 3), np.uint8)), clear, range(holes + 1)
-    ).astype(int)
-    fill = sizes <= largest * areas[around]
+    # An enclosed region has one drop around it and perhaps others inside: the largest beside it counts.
+    beside = cv2.dilate(areas[drops].astype(float), np.ones((3, 3), np.uint8))
+    fill = sizes <= largest * ndimage.maximum(beside, clear, range(holes + 1))
     fill[0] = False
     fill[rim] = False
     return drop_mask | fill[clear]

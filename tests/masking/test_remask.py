@@ -47,6 +47,22 @@ def test_water_has_no_holes_but_a_ring_of_drops_may_stand_around_dry_glass() -> 
     assert not without_holes(np.zeros((4, 4), bool)).any()
 
 
+def test_a_hole_that_another_drop_stands_in_is_still_a_hole() -> None:
+    drop_mask = np.zeros((30, 30), bool)
+    drop_mask[2:28, 2:28] = True  # 676 less the hole
+    drop_mask[10:20, 10:20] = False
+    drop_mask[14, 14] = True  # labelled after the drop around it, and smaller
+    assert without_holes(drop_mask)[2:28, 2:28].all()
+    turned = without_holes(drop_mask[::-1, ::-1])
+    assert np.array_equal(turned, without_holes(drop_mask)[::-1, ::-1])
+    # Dry glass inside a thin ring stays dry, with a drop in it or without.
+    ring = np.zeros((30, 30), bool)
+    ring[2:28, 2:28] = True
+    ring[3:27, 3:27] = False
+    ring[14, 14] = True
+    assert np.array_equal(without_holes(ring), ring)
+
+
 def test_opening_keeps_squares_and_drops_lines() -> None:
     drop_mask = np.zeros((9, 9), bool)
     drop_mask[1:4, 1:4] = True
