@@ -47,22 +47,32 @@ def scene_space(
     ``cams`` ``(V, 4, 4)`` cam_from_world, ``intrinsics`` ``(V, 5)`` fx, fy, cx, cy, k1, ``sizes``
     ``(V, 2)`` width and height; ``kind`` is ndc, contract or auto.
     """
+    k1 = intrinsics[:, 4]
+    sides = [(sizes * end - intrinsics[:, 2:4]) / intrinsics[:, :2] for end in (0, 1)]
     corners = np.empty((len(cams), 4, 3))
     for i, (right, bottom) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
-        x = (sizes[:, 0] * right - intrinsics[:, 2]) / intrinsics[:, 0]
-        y = (sizes[:, 1] * bottom - intrinsics[:, 3]) / intrinsics[:, 1]
-        gain = 1.0 + intrinsics[:, 4] * (x * x + y * y)
-        # For bounds a thousandth is enough: one step for most lenses.
-        for _ in range(UNDISTORT_STEPS):
-            better = 1.0 + intrinsics[:, 4] * (x * x + y * y) / gain**2
-            better = np.maximum(better, FOLDS)
-            if np.abs(better / gain - 1.0).max() < 1e-3:
-                break
-            gain = better
-        cam = np.stack([x / gain, y / gain, np.ones_like(x)], -1)
-        corners[:, i] = np.einsum("vji,vj->vi", cams[:, :3, :3], cam)
+        x, y = sides[right][:, 0], sides[bottom][:, 1]
+        # With k1 > 0 a side reaches farthest where it is nearest to the optical axis, not at its ends: these
+        # are then the corners of the upright rectangle around all that the camera sees.
+        beside_x, beside_y = np.where(k1 > 0, np.clip(0.0, *sides).T, [x, y])
+        x, y = x / _gain(x, beside_y, k1), y / _gain(beside_x, y, k1)
+        corners[:, i] = np.einsum(
+            "vji,vj->vi", cams[:, :3, :3], np.stack([x, y, np.ones_like(x)], -1)
+        )
     count = len(cams)
     return fit_space(kind, cams, corners, np.full(count, near), np.full(count, far))
+
+
+def _gain(x: np.ndarray, y: np.ndarray, k1: np.ndarray) -> np.ndarray:
+    """How many times farther from the axis places x, y ``(V,)`` of photos lie than without the lens's k1."""
+    gain = 1.0 + k1 * (x * x + y * y)
+    # For bounds a thousandth is enough: one step for most lenses.
+    for _ in range(UNDISTORT_STEPS):
+        better = np.maximum(1.0 + k1 * (x * x + y * y) / gain**2, FOLDS)
+        if np.abs(better / gain - 1.0).max() < 1e-3:
+            break
+        gain = better
+    return gain
 
 
 def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:

@@ -8,7 +8,7 @@ import torch
 
 from pipeline.field.model import scene_space
 from pipeline.geometry.rays import pixel_rays
-from pipeline.geometry.spaces import ndc
+from pipeline.geometry.spaces import fit_space, ndc
 
 
 @pytest.mark.parametrize("k1", [0.0, -0.05, -0.1, -0.15])
@@ -28,3 +28,53 @@ def test_corners_lie_within_the_space_through_any_lens(k1: float) -> None:
         for value, low, high in zip((x, y), space.low, space.high, strict=False):
             share = (value - low) / (high - low)
             assert share.min() > -0.005 and share.max() < 1.005
+
+
+def border(width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Columns and rows of the pixels along a photo's four sides."""
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    outer = (columns % (width - 1) == 0) | (rows % (height - 1) == 0)
+    return tuple(torch.from_numpy(v[outer].astype(np.float64)) for v in (columns, rows))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("centre", [(400.0, 300.0), (250.0, 420.0)])
+@pytest.mark.parametrize("k1", [0.02, 0.1, 0.2])
+def test_the_sides_lie_within_the_space_where_they_bulge_beyond_the_corners(
+    k1: float, centre: tuple[float, float]
+) -> None:
+    size, intrinsics = (800, 600), (800.0, 800.0, *centre, k1)
+    turn = np.radians([-0.4, 0.0, 0.3])
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(turn)
+    poses[:, 1, 0], poses[:, 0, 1] = np.sin(turn), -np.sin(turn)
+    space = scene_space("ndc", poses, np.array([intrinsics] * 3), np.array([size] * 3), 2.0, 20.0)
+    for pose in poses:
+        rays_o, rays_d = pixel_rays(
+            *border(*size), torch.tensor(intrinsics, dtype=torch.float64),
+            torch.from_numpy(pose[:3]), distorted=True,
+        )  # fmt: skip
+        x, y, _ = ndc(space.ref(rays_o) + space.turned(rays_d) * 5.0, space.near).numpy()
+        for value, low, high in zip((x, y), space.low, space.high, strict=False):
+            share = (value - low) / (high - low)
+            assert share.min() > -0.001 and share.max() < 1.001
+
+
+def test_sides_that_do_not_bulge_leave_the_bounds_to_the_corners_themselves() -> None:
+    """To the bit: fields fitted through lenses without k1 or with k1 < 0 do not know of the sides."""
+    size, near, far = (800, 600), 2.0, 20.0
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 0, 3] = [-0.3, 0.0, 0.2]
+    for k1 in (0.0, -0.08):
+        intrinsics = np.array([(560.0, 550.0, 390.0, 310.0, k1)] * 3)
+        space = scene_space("ndc", poses, intrinsics, np.array([size] * 3), near, far)
+        corners = np.empty((3, 4, 3))
+        for i, (column, row) in enumerate(((0, 0), (800, 0), (0, 600), (800, 600))):
+            x, y = (column - 390.0) / 560.0, (row - 310.0) / 550.0
+            gain = 1.0 + k1 * (x * x + y * y)
+            for _ in range(24):
+                better = 1.0 + k1 * (x * x + y * y) / gain**2
+                if abs(better / gain - 1.0) < 1e-3:
+                    break
+                gain = better
+            corners[:, i] = x / gain, y / gain, 1.0
+        assert space == fit_space("ndc", poses, corners, np.full(3, near), np.full(3, far))
