@@ -24,11 +24,14 @@ format: setup
 	ruff check --fix .
 	ruff format .
 
-# make scene SCENE=garden: everything for one scene of params.yaml
+# make scene SCENE=garden FROM=~/photos: a folder of photos, or a video, brought in and everything made of it;
+# without FROM: everything for one scene of params.yaml
 scene: setup
+	$(if $(FROM),python -m stages.ingest --scene $(SCENE) --from "$(FROM)")
 	dvc repro report@$(SCENE)
 	@python -m pipeline.evaluation.table artifacts/$(SCENE)/metrics.json
-	@echo "Open $(abspath artifacts/$(SCENE)/report/index.html)"
+	@echo "Cleaned photos: $(abspath artifacts/$(SCENE)/views/composite)"
+	@echo "The page, with what they are worth: open $(abspath artifacts/$(SCENE)/report/index.html)"
 
 # make tables PROFILE=quick: every method on every scene, see experiments/tables/README.md
 tables: setup
@@ -40,6 +43,7 @@ setup: $(VENV)/.ready
 
 $(VENV)/.ready: pyproject.toml constraints.txt
 	python3 -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed")'
+	@echo "Installing the packages into $(VENV), once: some minutes, most of them for torch."
 	python3 -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' -c constraints.txt
 	@touch $@

@@ -88,7 +88,9 @@ def _line(scene: str, what: str, numbers: dict[str, float], glass: str) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument(

@@ -58,8 +58,9 @@ def main(job: Job, params: Params) -> str:
             origin = Origin(kind="video", said=said)
         else:
             records, origin = _from_photos(job, capture, fresh, params)
-        write_images_json(fresh, with_split(records, params.holdout), origin)
-    for sentence in origin.said:
+        records = with_split(records, params.holdout)
+        write_images_json(fresh, records, origin)
+    for sentence in [*origin.said, *intake.few_said(records)]:
         log.warning("%s", sentence)
     width, height = records[0].size
     more = f", with poses from {origin.posed}" if origin.posed else ""

@@ -78,7 +78,11 @@ def main(job: Job, params: Params) -> str:
     if share == 0:
         log.warning("no drops were found in any image; lower masks.threshold if there are some")
     elif share > 0.6:
-        log.warning("%.0f %% of the pixels are masked; is masks.threshold too low?", 100 * share)
+        log.warning(
+            "%.0f %% of the pixels are masked, little is left to learn from: look at %s; where dry "
+            "glass is masked, raise masks.threshold, else wipe the glass and take the photos again",
+            100 * share, job.paths.masks,
+        )  # fmt: skip
     mode = "lens-fixed" if fixed else "image by image"
     return f"{100 * share:.1f} % of the pixels masked at {t:g}, {mode} ({why})"
 

@@ -59,7 +59,7 @@ def main(job: Job, params: Params) -> str:
             write_json(fresh / "seen.json", map_named(_count_seen, items, job_label="seen", **how))
         if filmed := params.path_frames if len(views) > 1 else 0:
             _film(job, params, list(views.values()), fresh, how)
-    return f"{len(records)} views, {filmed} frames of video"
+    return f"{len(records)} views, {filmed} frames of video in {paths.views}"
 
 
 def _render(nerf: Path, device: str, view: View, pose: np.ndarray, scale: float) -> RenderedView:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -62,5 +64,29 @@ def test_commands_and_parameters_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+    for target, anchor in re.findall(
+        r"\]\(([^)#:]*)#?([^):]*)\)", page.read_text(encoding="utf-8")
+    ):
+        other = page.parent / target if target else page
+        assert other.exists(), f"{page.name} links to {target}"
+        assert not anchor or anchor in _anchors(other), f"{page.name} links to {target}#{anchor}"
+
+
+def _anchors(page: Path) -> set[str]:
+    """What a page's headings are called in addresses."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    heads = [line.lstrip("#").strip().lower() for line in lines if line.startswith("#")]
+    return {re.sub(r"[^\w -]", "", head).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_one_command_brings_photos_in_and_makes_everything_of_them() -> None:
+    def recipes(*words: str) -> str:
+        told = ["make", "--dry-run", "--no-print-directory", "scene", "SCENE=garden", *words]
+        return subprocess.run(told, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    own = recipes("FROM=/my photos")
+    brought = own.index('python -m stages.ingest --scene garden --from "/my photos"')
+    assert brought < own.index("dvc repro report@garden") < own.index("garden/views/composite")
+    assert "stages.ingest" not in recipes()
+    assert "make scene SCENE=garden FROM=" in (ROOT / "README.md").read_text(encoding="utf-8")

@@ -1,6 +1,6 @@
 """Draws what a detector finds on photo pairs, and tells what its wrong pixels are.
 
-`python -m experiments.detector.overlays unet:weights/unet.safetensors OUT --pairs ../shared/real/qian`
+`python -m experiments.detector.overlays unet:weights/unet.safetensors OUT --pairs FOLDER_OF_PAIRS`
 
 OUT/<name>.png: the photo and its dry partner; below, what is found (green), marked where the photos hardly
 differ (red) and missed (blue), and the difference, three times as bright. One line per pair: the share of the

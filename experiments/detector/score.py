@@ -1,7 +1,7 @@
 """Scores detectors per test set: precision, recall, F1 and IoU at a threshold, the best, and AP.
 
 `python -m experiments.detector.score unet:weights/unet.safetensors --threshold 0.3 \\
-    --scenes data/demo --painted artifacts/pools/photos/unseen --pairs ../shared/real/qian \\
+    --scenes data/demo --painted artifacts/pools/photos/unseen --pairs FOLDER_OF_PAIRS \\
     --rendered artifacts/pools/rendered_unseen --dry artifacts/pools/photos/unseen`
 
 A scene is a folder with photos and truth/coverage/, as the stage synthesize makes it; it is scored

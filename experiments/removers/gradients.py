@@ -26,7 +26,9 @@ LAYERS = ("enc1_1", "enc1_3.conv1_2", "enc2_1", "enc2_3.conv1_1", "enc3_1", "enc
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("chunk", type=Path)
     parser.add_argument("--weights", type=Path)
     flags = parser.parse_args()

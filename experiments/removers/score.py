@@ -1,7 +1,7 @@
 """Scores a remover per test set: PSNR, SSIM and FLIP of restored photos against dry ones.
 
 `python -m experiments.removers.score attgan --scenes data/demo --photos artifacts/pools/photos/unseen \\
-    --pairs ../shared/real/qian --scratch artifacts/.work/demo/train_remover --out /tmp/attgan`
+    --pairs FOLDER_OF_PAIRS --scratch artifacts/.work/demo/train_remover --out /tmp/attgan`
 
 Beside each figure stands that of the photo as it is. Sets: painted pictures and clips on unseen photos
 (those after the ones that training's curve is drawn by), every SIXTH view of scenes with truth/clean, and
@@ -105,7 +105,9 @@ def figures(found: np.ndarray, case: Case) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("method", choices=("attgan", "quan", "wen"))
     parser.add_argument("--weights", type=Path, help="default: weights/removers/METHOD.safetensors")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])

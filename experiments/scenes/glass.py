@@ -105,7 +105,9 @@ def panels() -> list[np.ndarray]:
 
 def main() -> None:
     """Writes the sheet."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     out = parser.parse_args().out
     parts = panels()

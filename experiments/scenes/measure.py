@@ -103,7 +103,9 @@ def posed_views_per_second(count: int = 6) -> float:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scenes", nargs="*", metavar="SCENE")
     chosen = parser.parse_args().scenes
     chosen = chosen or ["street", "street-move", "room", "harbour", "harbour-move"]

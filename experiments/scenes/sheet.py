@@ -31,7 +31,9 @@ def sheet(data: Path, width: int = 300) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path, help="a scene's folder, with its truth")
     parser.add_argument("out", type=Path)
     flags = parser.parse_args()

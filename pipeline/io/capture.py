@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -182,6 +183,10 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
     What belongs to the capture is copied and nothing else, with its place in the folder kept; `truth/`
     goes along. UserError when `data` exists, or when the capture cannot be used.
     """
+    with suppress(RuntimeError):  # no such home: told below as a path that does not exist
+        source = (
+            source.expanduser()
+        )  # make, and some shells behind it, leave FROM=~/photos as it is
     source = Path(os.path.normpath(source))
     if data.exists():
         raise UserError(

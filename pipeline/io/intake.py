@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from pipeline.io.scene import ImageRecord
 from pipeline.io.transforms import View
 
 SUSPECT = 0.6  # a set of masks that drops more than this is likely upside down
+FEW = 12  # photos; a rule of thumb: docs/capture.md advises 20 to 40
 
 
 def enough(plan: Plan, photos: Mapping[str, Photo], at_least: int) -> Plan:
@@ -29,6 +30,17 @@ def enough(plan: Plan, photos: Mapping[str, Photo], at_least: int) -> Plan:
             f"A scene needs at least {at_least} photos of one shape, taken from different places.",
         )
     return plan
+
+
+def few_said(records: Sequence[ImageRecord]) -> list[str]:
+    """What the user should hear of so few images that drops may hide the same spot in most of them."""
+    if len(records) >= FEW:
+        return []
+    held_out = sum(record.split == "test" for record in records)
+    kept_back = f", and {held_out} of them held out to judge the fit by" if held_out else ""
+    return [
+        f"{len(records)} images are few{kept_back}: twenty or more, from different places, work best"
+    ]
 
 
 def given_turns(

@@ -122,7 +122,7 @@ def triangulate(
     names, settings = sorted(names), replace(settings, camera="per_image")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
     given = _of_these(given, sizes, image_dir)
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     work_dir.mkdir(parents=True, exist_ok=True)
     report = progress if progress is not None else silent
     database = work_dir / "database.db"

@@ -89,7 +89,7 @@ def reconstruct(
     if len(names) < 2:
         raise UserError(f"{len(names)} photo in {image_dir}: poses need two or more.")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     work_dir.mkdir(parents=True, exist_ok=True)
     report = progress if progress is not None else silent
     tries: list[_Try] = []
@@ -109,7 +109,7 @@ def reconstruct(
         )
         models = [model for model in models if usable(model, len(names))]
         tries.append(_Try(label, attempt, models, matching))
-        log.info("%s: %d of %d photos placed", label, tries[-1].registered, len(names))
+        log.info("attempt (%s): %d of %d photos placed", label, tries[-1].registered, len(names))
         if best is None or tries[-1].beats(best):
             best = tries[-1]
         if best.registered == len(names):

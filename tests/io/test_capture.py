@@ -344,6 +344,18 @@ def test_adopting_copies_what_belongs_and_nothing_else(tmp_path: Path) -> None:
         adopt(source, data, 3, _no_colmap)
 
 
+def test_a_tilde_that_no_shell_has_expanded_is_the_home_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`make scene FROM=~/photos` gets there so from some shells."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    _photos(tmp_path / "my photos")
+    adopt(Path("~/my photos"), tmp_path / "data/garden", 3, _no_colmap)
+    assert sorted(path.name for path in (tmp_path / "data/garden").iterdir()) == list(NAMES)
+    with pytest.raises(UserError, match="~nobody-here/photos does not exist"):
+        adopt(Path("~nobody-here/photos"), tmp_path / "data/other", 3, _no_colmap)
+
+
 @pytest.mark.parametrize("kind", ["../elsewhere/", "/absolute/"])
 def test_photos_outside_of_the_folder_are_refused(tmp_path: Path, kind: str) -> None:
     source = tmp_path / "capture"

@@ -58,6 +58,22 @@ def test_plain_photos_have_no_given_poses_or_masks(tmp_path: Path) -> None:
     assert read_origin(images).posed == read_origin(images).masked == ""
 
 
+def test_few_photos_are_told_and_many_are_not(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(11):
+        _photo(tmp_path / f"data/made/{number:02d}.jpg")
+    _ingest(tmp_path, holdout=8)
+    assert "11 images are few, and 2 of them held out" in caplog.text
+    caplog.clear()
+    _ingest(tmp_path, holdout=0)
+    assert "11 images are few: twenty or more" in caplog.text
+    caplog.clear()
+    _photo(tmp_path / "data/made/11.jpg")
+    _ingest(tmp_path)
+    assert "few" not in caplog.text
+
+
 def test_mixed_sizes_come_out_as_one_and_it_is_kept_on_record(tmp_path: Path) -> None:
     for number, size in enumerate([(80, 60), (40, 30), (80, 60), (50, 30)]):
         _photo(tmp_path / f"data/made/{number}.jpg", size)
