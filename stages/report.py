@@ -53,18 +53,20 @@ def main(job: Job, params: Params) -> str:
     refined = read_if_there(paths.refine / "refine.json", "refine", accounts.REFINE)
     lost = gather.lost_images(account)
     heat, heat_max = gather.coverage_heat(paths, records, params.picture_size, params.quality)
+    seen = read_if_there(paths.views / "seen.json", "render", accounts.SEEN)
     film, film_missing = gather.video(paths.views / "path.mp4")
     page = Page(
         scene=job.scene,
         headline=numbers.headline(metrics, other, params.compare),
-        tiles=numbers.tiles(metrics, other, params.compare),
+        tiles=numbers.tiles(metrics, other, params.compare, seen),
         table=numbers.table(metrics, other),
         compared=params.compare if other else "",
-        photos=_photos(paths, records, pictures, dict(lost)),
+        photos=_photos(paths, records, pictures, dict(lost), seen),
         charts=charts(paths, other_paths, records),
         coverage=heat,
         coverage_max=heat_max,
-        masks_note=notes.masks_note(masks) + notes.rounds_note(refined, metrics.get("rounds", {})),
+        masks_note=notes.masks_note(masks) + notes.loop_note(refined),
+        rounds=notes.round_notes(refined, metrics.get("rounds", {})),
         poses_note=notes.poses_note(account, len(records)),
         lost=lost,
         tried=gather.attempts(account),
@@ -98,9 +100,9 @@ def _photos(
     records: Sequence[ImageRecord],
     pictures: Mapping[str, Mapping[str, str]],
     lost: Mapping[str, str],
+    seen: Mapping[str, Mapping[str, float]],
 ) -> list[Photo]:
     rows = gather.image_numbers(paths.metrics_csv)
-    seen = read_if_there(paths.views / "seen.json", "render", accounts.SEEN)
     photos = []
     for record in records:
         name, ratio = record.name, record.width / record.height

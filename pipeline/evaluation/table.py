@@ -22,10 +22,11 @@ COLUMNS = (
     ("SSIM", "composite.ssim", "{:.3f}"),
     ("photo PSNR", "input.psnr", "{:.2f}"),
     ("mask IoU", "masks.iou", "{:.3f}"),
-    ("to photos", "selfcheck.kept_psnr", "{:.2f}"),
+    ("PSNR to photos", "selfcheck.kept_psnr", "{:.2f}"),
     ("masked", "masks.coverage", "{:.1%}"),
 )
 MISSING = "-"
+LIKE_THE_ONE_BEFORE = {"composite.ssim": "composite SSIM"}  # headings that say too little alone
 
 
 def look_up(metrics: Mapping[str, Any], name: str) -> float | None:
@@ -48,7 +49,7 @@ def reasons(metrics: Mapping[str, Any]) -> dict[str, str]:
 def table(fits: Mapping[str, Mapping[str, Any]]) -> str:
     """An aligned Markdown table, one row per fit by label, then why numbers are missing.
 
-    Columns that no fit has a number for are left out; "to photos" is the PSNR of held-out views to the
+    Columns that no fit has a number for are left out; "PSNR to photos" is that of held-out views to the
     photos beside the drops.
     """
     columns = [
@@ -102,13 +103,14 @@ def _line(row: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _notes(fits: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    shown = {name for _, name, _ in COLUMNS}
     notes: dict[str, list[str]] = {}
     for metrics in fits.values():
-        for name, text in reasons(metrics).items():
-            if name in shown and name not in notes.setdefault(text, []):
-                notes[text].append(name)
-    return [f"{MISSING} {', '.join(names)}: {text}" for text, names in notes.items()]
+        why = reasons(metrics)
+        for heading, name, _ in COLUMNS:
+            told = LIKE_THE_ONE_BEFORE.get(name, heading)
+            if name in why and told not in notes.setdefault(why[name], []):
+                notes[why[name]].append(told)
+    return [f"Not measured, since {text}: {', '.join(told)}." for text, told in notes.items()]
 
 
 def main(paths: Sequence[str]) -> int:

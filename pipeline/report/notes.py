@@ -35,23 +35,28 @@ def masks_note(about: Mapping[str, Any]) -> str:
     return f"{mode}: {about.get('why', 'for no given reason')}.{cut}"
 
 
-def rounds_note(about: Mapping[str, Any], scores: Mapping[str, Mapping[str, float]]) -> str:
-    """What the loop did to the masks, from refine.json and the rounds of metrics.json; "" without it."""
+def loop_note(about: Mapping[str, Any]) -> str:
+    """Whether the loop repaired the masks and why it ended, from refine.json; "" without it."""
     if not about:
         return ""
+    why = about.get("why", "for no given reason")
+    if not about.get("rounds"):
+        return f" They were not repaired from the scene: {why}."
+    return f" Repaired from the scene: {why}."
+
+
+def round_notes(about: Mapping[str, Any], scores: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """What each round made of the masks, from refine.json and the rounds of metrics.json."""
     rounds = []
     for number, told in sorted(about.get("rounds", {}).items(), key=lambda item: int(item[0])):
-        text = f"round {number}: {told['coverage']:.1%} dropped"
+        text = f"Round {number}: {told['coverage']:.1%} dropped"
         score = scores.get(number, {})
         if "iou" in score:
             text += f", IoU {score['iou']:.3f}"
         if "test_psnr" in score:
             text += f", a brief fit on them {score['test_psnr']:.1f} dB"
-        rounds.append(text)
-    why = about.get("why", "for no given reason")
-    if not rounds:
-        return f" They were not repaired from the scene: {why}."
-    return f" Repaired from the scene: {why}. {'; '.join(rounds)}."
+        rounds.append(f"{text}.")
+    return rounds
 
 
 def poses_note(account: Mapping[str, Any], total: int) -> str:

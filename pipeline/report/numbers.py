@@ -102,9 +102,15 @@ def called(variant: str) -> str:
 
 
 def tiles(
-    metrics: Mapping[str, Any], other: Mapping[str, Any] | None, variant: str = "unmasked"
+    metrics: Mapping[str, Any],
+    other: Mapping[str, Any] | None,
+    variant: str = "unmasked",
+    seen: Mapping[str, Mapping[str, float]] | None = None,
 ) -> list[tuple[str, str, str]]:
-    """The few numbers that matter: (number, unit, what it is). `other` are those of the fit `variant`."""
+    """The few numbers that matter: (number, unit, what it is).
+
+    `other` are those of the fit `variant`, `seen` what seen.json tells of each view.
+    """
     found: list[tuple[str, str, str]] = []
     test, photo = value(metrics, "test.psnr"), value(metrics, "input.psnr")
     theirs = value(other, "test.psnr") if other else None
@@ -122,6 +128,10 @@ def tiles(
             found.append((f"{score:.2f}", "", text))
     if (share := value(metrics, "masks.coverage")) is not None:
         found.append((f"{100 * share:.0f}", "%", "of the pixels taken for drops"))
+    never = [view["never"] for view in (seen or {}).values() if "never" in view]
+    if never:
+        guessed = 100 * sum(never) / len(never)
+        found.append((f"{guessed:.1f}", "%", "of the views seen by no fitted photo: guessed"))
     placed, total = value(metrics, "poses.registered"), value(metrics, "poses.total")
     if placed is not None and total is not None:
         found.append((f"{placed}/{total}", "", "photos placed"))

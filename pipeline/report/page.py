@@ -48,6 +48,7 @@ class Page:
     coverage: str
     coverage_max: float
     masks_note: str
+    rounds: list[str]
     poses_note: str
     lost: list[tuple[str, str]]
     tried: list[tuple[str, str]]

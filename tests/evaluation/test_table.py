@@ -17,7 +17,20 @@ def test_rows_align_and_gaps_are_explained():
     lines = table({"demo": MASKED, "demo unmasked": UNMASKED}).splitlines()
     assert len({len(line) for line in lines[:4]}) == 1
     assert lines[2].startswith("| demo          |     28.46 | 0.910 |    0.850 |")
-    assert lines[4] == "- test.lpips: no weights"
+    assert lines[4] == "Not measured, since no weights: LPIPS."
+
+
+def test_what_cannot_be_measured_is_told_once_under_its_heading():
+    none = {
+        "psnr": None,
+        "psnr_reason": "there is no truth",
+        "ssim": None,
+        "ssim_reason": "there is no truth",
+    }
+    lines = table({"garden": {"test": none, "composite": none}}).splitlines()
+    assert lines[3:] == [
+        "Not measured, since there is no truth: test PSNR, SSIM, composite PSNR, composite SSIM."
+    ]
 
 
 def test_the_gain_is_told_when_both_are_known():

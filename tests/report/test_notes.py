@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pipeline.report.notes import masks_note, poses_note, rounds_note
+from pipeline.report.notes import loop_note, masks_note, poses_note, round_notes
 
 
 def test_the_rounds_are_told_in_their_order_with_what_is_known() -> None:
@@ -8,13 +8,12 @@ def test_the_rounds_are_told_in_their_order_with_what_is_known() -> None:
         "why": "on the lens; the masks have settled",
         "rounds": {"10": {"coverage": 0.25}, "9": {"coverage": 0.5}},
     }
-    note = rounds_note(about, {"9": {"iou": 0.5, "test_psnr": 20.04}})
-    assert "on the lens; the masks have settled." in note
-    assert (
-        "round 9: 50.0% dropped, IoU 0.500, a brief fit on them 20.0 dB; round 10: 25.0% dropped."
-        in note
-    )
-    assert rounds_note({}, {}) == ""
+    assert "on the lens; the masks have settled." in loop_note(about)
+    assert round_notes(about, {"9": {"iou": 0.5, "test_psnr": 20.04}}) == [
+        "Round 9: 50.0% dropped, IoU 0.500, a brief fit on them 20.0 dB.",
+        "Round 10: 25.0% dropped.",
+    ]
+    assert loop_note({}) == "" and round_notes({}, {}) == []
 
 
 def test_masks_that_came_along_have_no_threshold_and_no_rounds() -> None:
@@ -23,7 +22,7 @@ def test_masks_that_came_along_have_no_threshold_and_no_rounds() -> None:
     assert masks_note({"mode": "per-image", "why": "w", "threshold": 0.25}).endswith(
         ": w. Threshold 0.25."
     )
-    untouched = rounds_note({"mode": "none", "why": why, "rounds": {}}, {})
+    untouched = loop_note({"mode": "none", "why": why, "rounds": {}})
     assert untouched == f" They were not repaired from the scene: {why}."
 
 

@@ -45,6 +45,14 @@ def test_headline_and_tiles_tell_gain_and_loss_alike():
     assert "over" not in str(tiles(OWN, None)) and "23/24" in str(tiles(OWN, None))
 
 
+def test_what_no_photo_shows_is_told_as_guessed():
+    seen = {"a.png": {"never": 0.01, "fewer_than_3": 0.5}, "b.png": {"never": 0.03}}
+    assert ("2.0", "%", "of the views seen by no fitted photo: guessed") in tiles(
+        OWN, None, seen=seen
+    )
+    assert "guessed" not in str(tiles(OWN, None)) + str(tiles(OWN, None, seen={}))
+
+
 def test_without_references_nothing_is_claimed():
     blind = {
         "test": {"psnr": None, "psnr_reason": "none", "ssim": None, "ssim_reason": "none"},
