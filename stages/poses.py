@@ -92,6 +92,7 @@ def _found(job: Job, params: Params, records: Sequence[ImageRecord]) -> sfm.Reco
         return found
     images = read_posed_images(paths.images, masks, found.views)
     each = partial(map_named, job_label="align", workers=None if job.device == "cpu" else 1)
+    log.info("the cameras are aligned to the photos, in %d rounds at most", params.align_rounds)
     fits = (params.align_first_steps, *[params.align_steps] * (params.align_rounds - 1))
     poses = aligned_poses(
         images, each, fits, params.align_scale, landmarks=found.points_xyz, threads=cores(),
