@@ -82,18 +82,18 @@ def window(
         (0, 0, 0.05, h),
         (0, -h * 0.15, w, 0.04),
     )
-    for dx, dy, sx, sy in bars:
+    for number, (dx, dy, sx, sy) in enumerate(bars):  # those that cross end in planes of their own
         p = middle + right * dx + np.array([0, dy, 0], np.float32) + out * 0.05
-        b.box("paint", p, (sx, sy, 0.10), yaw=yaw, tint=white, step=0.6)
+        b.box("paint", p, (sx, sy, 0.10 - 0.004 * number), yaw=yaw, tint=white, step=0.6)
     sill = middle + np.array([0, h / 2 + 0.08, 0], np.float32) + out * 0.1
-    b.box("stone", sill, (w + 0.3, 0.09, 0.24), yaw=yaw, step=0.5)
+    b.box("stone", sill, (w + 0.08, 0.09, 0.24), yaw=yaw, step=0.5)
     if rng.random() < 0.45:
         for side in (-1, 1):
             p = middle + right * side * (w * 0.5 + 0.27) + out * 0.06
             b.box(
                 "wood",
                 p,
-                (0.42, h, 0.06),
+                (0.42, h, 0.05 + 0.006 * side),  # two windows' shutters may lie one upon the other
                 yaw=yaw,
                 tint=np.asarray(paint) * 1.9,
                 tile=0.8,
@@ -125,8 +125,8 @@ def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, pa
     out, up, yaw = front(right)
     b.box(
         "wood",
-        left + right * width / 2 + up * 0.35 + out * 0.06,
-        (width, 0.7, 0.12),
+        left + right * width / 2 + up * 0.35 + out * 0.07,
+        (width - 0.02, 0.7, 0.12),
         yaw=yaw,
         tint=paint * 2.2,
     )
@@ -194,7 +194,7 @@ def ground_floor(
         if k == n // 2:
             b.box(
                 "wood",
-                p + up * 1.05 + out * 0.03,
+                p + up * 1.05 + out * 0.035,
                 (0.95, 2.1, 0.1),
                 yaw=yaw,
                 tint=paint * 1.7,
@@ -217,10 +217,14 @@ def house(b: Builder, rng: Rng, left: Array, right: Array, width: float, height:
     )
     wall: dict[str, Any] = {"tile": 1.6, "tint": tint, "shift": tuple(rng.random(2))}
     b.panel(kind, left + up * height, right * width, -up * height, **wall)
-    for end in (left, left + right * width):  # the gable ends
-        b.panel(kind, end + up * height - out * 3, out * 3, -up * height, **wall)
-        b.panel(kind, end + up * height, -out * 3, -up * height, **wall)
-        b.box("stone", end + up * height / 2 + out * 0.03, (0.18, height, 0.1), yaw=yaw, tile=0.8)
+    # The gable ends and quoins keep within the house: in one plane with the neighbour's it would be
+    # chance which of the two a ray meets.
+    near, far = left + right * 0.01, left + right * (width - 0.01)
+    b.panel(kind, near + up * height - out * 3, out * 3, -up * height, **wall)
+    b.panel(kind, far + up * height, -out * 3, -up * height, **wall)
+    for x in (0.11, width - 0.11):
+        quoin = left + right * x + up * height / 2 + out * 0.03
+        b.box("stone", quoin, (0.18, height, 0.1), yaw=yaw, tile=0.8)
     for level in (0.12, 2.98, height - 0.06):
         b.box(
             "stone",
