@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from pipeline.field.align import aligned
 from pipeline.field.buffer import RayBuffer, photos_to_fit
@@ -69,14 +70,20 @@ class GrowingField:
         """Fits the images that are not held out, without the pixels of `drop_masks` (by name)."""
         images = [replace(image, keep_mask=~drop_masks[image.record.name]) for image in self.images]
         seed = self.seed + len(self.psnr)
-        record = fit(
-            self.field,
-            RayBuffer(photos_to_fit(images, self.near, self.far), seed, self.device),
-            steps=steps,
-            batch_rays=batch_rays,
-            seed=seed,
-            threads=threads,
-        )
+        with tqdm(total=steps, desc="brief fit", unit="step", leave=False) as bar:
+
+            def show(step: int, loss: float, psnr: float) -> None:
+                bar.update(step - bar.n)
+
+            record = fit(
+                self.field,
+                RayBuffer(photos_to_fit(images, self.near, self.far), seed, self.device),
+                steps=steps,
+                batch_rays=batch_rays,
+                seed=seed,
+                threads=threads,
+                progress=show,
+            )
         self.psnr.append(record.rows[-1][2])
 
     def view(self, image: PosedImage, cam_from_world: np.ndarray | None = None) -> RenderedView:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import shutil
 from collections.abc import Callable, Iterable, Sequence
@@ -181,36 +182,47 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
     """Copies a capture, a folder or a video file, to `data`, which appears whole or not at all.
 
     What belongs to the capture is copied and nothing else, with its place in the folder kept; `truth/`
-    goes along. UserError when `data` exists, or when the capture cannot be used.
+    goes along. A copy that is there already and equals the capture stays, as when a run goes on. UserError
+    when `data` is anything else, or when the capture cannot be used.
     """
     with suppress(RuntimeError):  # no such home: told below as a path that does not exist
         source = (
             source.expanduser()
         )  # make, and some shells behind it, leave FROM=~/photos as it is
     source = Path(os.path.normpath(source))
-    if data.exists():
-        raise UserError(
-            f"{data} exists already.",
-            "Leave --from away to use it, remove it to bring the photos in anew, or choose another --scene.",
-        )
-    if source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
-        with publish_dir(data) as fresh:
-            shutil.copyfile(source, fresh / source.name)
-        return
     if not source.exists():
         raise UserError(f"{source} does not exist.", "Look for a slip of the pen in --from.")
-    if not source.is_dir():
+    if source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
+        root, files = source.parent, [source]
+    elif source.is_dir():
+        capture = find_capture(source, at_least, read_colmap)
+        refuse_outside(source, capture)
+        root, files = source, _belonging(source, capture)
+    else:
         raise UserError(f"{source} is no folder and no video.", "Name the folder of your photos.")
-    capture = find_capture(source, at_least, read_colmap)
-    refuse_outside(source, capture)
-    files = _belonging(source, capture)
+    if data.exists():
+        _refuse_other(data, root, files)
+        return
     with publish_dir(data) as fresh:
         for path in files:
-            target = fresh / path.relative_to(source)
+            target = fresh / path.relative_to(root)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
         if (source / TRUTH).is_dir():
             _copy_folder(source / TRUTH, fresh / TRUTH)
+
+
+def _refuse_other(data: Path, root: Path, files: Iterable[Path]) -> None:
+    """UserError unless `data` holds these files of `root`, byte for byte, and nothing besides its truth."""
+    wanted = {path.relative_to(root): path for path in files}
+    held = {path.relative_to(data): path for path in data.rglob("*") if path.is_file()}
+    same = wanted.keys() == {path for path in held if path.parts[0] != TRUTH}
+    if not same or not all(filecmp.cmp(path, held[p], shallow=False) for p, path in wanted.items()):
+        raise UserError(
+            f"{data} exists already and holds something else.",
+            "Leave --from (FROM) away to use it, remove it to bring the photos in anew, or choose another "
+            "scene.",
+        )
 
 
 def _copy_folder(source: Path, target: Path) -> None:

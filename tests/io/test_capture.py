@@ -340,8 +340,28 @@ def test_adopting_copies_what_belongs_and_nothing_else(tmp_path: Path) -> None:
     files = {path.relative_to(data).as_posix() for path in data.rglob("*") if path.is_file()}
     assert files == {*(f"images/{n}" for n in NAMES), "transforms.json", "truth/cameras.json"}
     assert _find(data).posed_by == "nerfstudio"
-    with pytest.raises(UserError, match="exists already"):
+
+
+@pytest.mark.parametrize("change", ["none", "another photo", "other bytes", "one more here"])
+def test_a_scene_is_only_brought_in_again_when_it_is_the_same(tmp_path: Path, change: str) -> None:
+    """A run that was stopped goes on with the same command; photos are never exchanged unasked."""
+    source, data = tmp_path / "capture", tmp_path / "data/garden"
+    _photos(source)
+    adopt(source, data, 3, _no_colmap)
+    before = {path: path.read_bytes() for path in data.iterdir()}
+    if change == "another photo":
+        (source / "z.jpg").write_bytes((source / NAMES[0]).read_bytes())
+    elif change == "other bytes":
+        (source / NAMES[0]).write_bytes((source / NAMES[0]).read_bytes() + b"\0")
+    elif change == "one more here":
+        (data / "z.jpg").write_bytes(b"mine")
+        before[data / "z.jpg"] = b"mine"
+    if change == "none":
         adopt(source, data, 3, _no_colmap)
+    else:
+        with pytest.raises(UserError, match="exists already and holds something else"):
+            adopt(source, data, 3, _no_colmap)
+    assert {path: path.read_bytes() for path in data.iterdir()} == before
 
 
 def test_a_tilde_that_no_shell_has_expanded_is_the_home_folder(

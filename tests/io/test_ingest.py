@@ -198,8 +198,10 @@ def test_one_command_brings_a_folder_in(tmp_path: Path) -> None:
     assert (root / "artifacts/garden/images/images.json").is_file()
     after = (root / "params.yaml").read_text()
     assert after.replace("  garden: {<<: *scene}\n", "") == before, "nothing else has changed"
+    assert _from(root, "garden", tmp_path / "holiday").returncode == 0, "goes on where it was"
+    _photo(tmp_path / "holiday/d.jpg")
     again = _from(root, "garden", tmp_path / "holiday")
-    assert again.returncode == 2 and "exists already" in again.stderr
+    assert again.returncode == 2 and "exists already and holds something else" in again.stderr
     assert (root / "params.yaml").read_text() == after
     bad = _from(root, "shed", tmp_path / "nowhere")
     assert bad.returncode == 2 and "nowhere does not exist" in bad.stderr
