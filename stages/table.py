@@ -27,7 +27,6 @@ PICTURES = {
     "NeRF": "nerf-{}", "AttGAN": "attgan", "Quan": "quan", "Wen": "wen", "no mean map": "unaveraged-{}",
     "DerainNeRF": "derain-{}", "with the loop": "loop-{}", "true masks": "true-{}",
 }  # fmt: skip
-Found = dict[tuple[str, str, str], tuple[float, ...]]
 
 
 class Params(Section):
@@ -42,15 +41,17 @@ class Params(Section):
 
 def main(job: Job, params: Params) -> str:
     """Makes `tables/`: each table as Markdown, CSV and LaTeX, and one strip of crops per scene."""
-    found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    found: dict[tuple[str, str, str], dict[int, float]] = defaultdict(dict)
     missing: dict[tuple[str, str], str] = {}
     poses, conventions = {}, {}
     for scene in params.scenes:
         for row in ROWS:
+            lacking = []
             for seed in params.seeds if row.seeded else params.seeds[:1]:
                 paths = ScenePaths(job.root, scene, f"{row.key}-{seed}" if row.seeded else row.key)
                 if not paths.metrics.is_file():
-                    missing[scene, row.id] = _why(row, scene, params)
+                    lacking.append(seed)
+                    missing[scene, row.id] = _why(row, scene, params, lacking)
                     continue
                 metrics = read_metrics(paths.metrics)
                 poses[scene], conventions = metrics["poses"], metrics["conventions"]
@@ -58,21 +59,19 @@ def main(job: Job, params: Params) -> str:
                 if row.id in ("unaveraged", "derain", "loop"):
                     scores |= mask_scores(metrics)
                 for name, value in scores.items():
-                    found[scene, row.id, name].append(value)
+                    found[scene, row.id, name][seed] = value
                 for name, value in gathered_scores(metrics).items() if row.id == "loop" else ():
-                    found[scene, "gathered", name].append(value)
+                    found[scene, "gathered", name][seed] = value
     if not poses:
         raise UserError("No row of the comparison has metrics yet.", "Run `make tables` first.")
-    scores_ = {key: tuple(values) for key, values in found.items()}
-    covered = float(conventions["mask_threshold"])
     told = [*params.notes, *(f"{name}: {conventions[name]}." for name in ("psnr", "ssim", "flip"))]
-    told.append(_lpips(scores_, str(conventions["lpips_net"])))
+    told.append(_lpips(found, str(conventions["lpips_net"])))
     tables = (
-        compose.comparison(scores_, params.scenes, missing, told),
+        compose.comparison(found, params.scenes, missing, told),
         compose.paper_comparison(),
-        compose.gains(scores_, params.scenes, missing),
-        compose.ablation(scores_, params.lens),
-        compose.mask_quality(scores_, params.scenes, missing, covered),
+        compose.gains(found, params.scenes, missing),
+        compose.ablation(found, params.lens, missing),
+        compose.mask_quality(found, params.scenes, missing, float(conventions["mask_threshold"])),
         compose.pose_quality(poses, params.scenes),
     )
     with publish_dir(job.paths.tables) as fresh:
@@ -83,17 +82,18 @@ def main(job: Job, params: Params) -> str:
         write_text(fresh / "tables.md", "\n".join(pages))
         for scene in params.scenes:
             _strip(ScenePaths(job.root, scene), params.seeds[0], fresh / f"{scene}.png")
-    runs = sum(len(values) for (_, _, name), values in scores_.items() if name == "psnr")
+    runs = sum(len(values) for (_, _, name), values in found.items() if name == "psnr")
     return f"{runs} scores, {len(missing)} cells without all of their runs, in {job.paths.tables}"
 
 
-def _why(row: Row, scene: str, params: Params) -> str:
+def _why(row: Row, scene: str, params: Params, lacking: list[int]) -> str:
     if row.key == "unaveraged" and scene not in params.lens:
         return "equation 5 is for drops on the lens; without it the masks are those of the next row"
-    return "not computed, or not for every seed"
+    some = row.seeded and lacking != params.seeds
+    return "not computed" + (f" for seed {', '.join(map(str, lacking))}" if some else "")
 
 
-def _lpips(scores: Found, net: str) -> str:
+def _lpips(scores: compose.Scores, net: str) -> str:
     if any(name == "lpips" for _, _, name in scores):
         return f"LPIPS: {net}."
     return f"LPIPS ({net}) is left out: its weights cannot be shipped; see evaluate.lpips_backbone."

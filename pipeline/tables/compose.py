@@ -8,9 +8,10 @@ from pipeline.tables.layout import Column, Line, Table, Values
 from pipeline.tables.rows import PAPER, PAPER_ABLATION, PAPER_METRICS, PAPER_SCENES, ROWS
 from pipeline.tables.statistics import better_beyond_spread, mean
 
-# scene, row, number -> the values of the seeds
-Scores = Mapping[tuple[str, str, str], Values]
-Missing = Mapping[tuple[str, str], str]  # scene, row -> why it has no numbers
+# scene, row, number -> the values by seed
+Scores = Mapping[tuple[str, str, str], Mapping[int, float]]
+# scene, row -> why it has no numbers, or not for every seed
+Missing = Mapping[tuple[str, str], str]
 
 NUMBERS = {
     "psnr": ("PSNR", 2, True),
@@ -41,7 +42,7 @@ def comparison(
     names = [n for n in NUMBERS if n != "lpips" or any(key[2] == n for key in scores)]
     lines = tuple(Line(row.id, row.label, row.competes) for row in ROWS)
     columns = tuple(Column(f"{scene} {n}", scene, *NUMBERS[n]) for scene in scenes for n in names)
-    cells = {(row, f"{scene} {n}"): values for (scene, row, n), values in scores.items()}
+    cells = {(row, f"{scene} {n}"): _values(scores, scene, row, n) for scene, row, n in scores}
     gaps = {(row, f"{scene} {n}"): why for (scene, row), why in missing.items() for n in NUMBERS}
     return Table("comparison", "Every method on every scene, held-out views", lines, columns, cells,
                  gaps, notes=tuple(notes))  # fmt: skip
@@ -68,22 +69,28 @@ def paper_comparison() -> Table:
 def gains(scores: Scores, scenes: Sequence[str], missing: Missing) -> Table:
     """How many dB of PSNR one row is ahead of another, here and in the paper.
 
-    A cell here is marked when the gain (or the loss) is larger than the spreads of both rows together.
+    A cell here is marked when the gain (or the loss) is larger than the spreads of both rows together,
+    but never when a row has the value of a single seed where more are wanted: its spread is not known.
     """
     labels = {"derain": "DerainNeRF"} | {row.key: row.paper for row in ROWS if row.key != "derain"}
     cells: dict[tuple[str, str], Values] = {}
     gaps, marked = {}, set()
     for one, other, label in GAINS:
         for scene in scenes:
-            a, b = (scores.get((scene, key, "psnr"), ()) for key in (one, other))
             place = (label, f"here {scene}")
+            a, b = (_values(scores, scene, key, "psnr") for key in (one, other))
+            partly = [
+                (values, missing.get((scene, key), "not computed"))
+                for key, values in ((one, a), (other, b))
+                if not values or (scene, key) in missing
+            ]
+            if partly:  # of a row without values rather than of one that lacks some
+                gaps[place] = min(partly, key=lambda row: bool(row[0]))[1]
             if a and b:
                 cells[place] = (mean(a) - mean(b),)
-                if better_beyond_spread(a, b) or better_beyond_spread(b, a):
+                sure = all(len(values) > 1 for values, _ in partly)
+                if sure and (better_beyond_spread(a, b) or better_beyond_spread(b, a)):
                     marked.add(place)
-            else:
-                lacking = one if not a else other
-                gaps[place] = missing.get((scene, lacking), "not computed")
         for i, scene in enumerate(PAPER_SCENES):
             ours = "DerainNeRF" if one in ("loop", "derain") else ""
             theirs = labels[other]
@@ -103,8 +110,11 @@ def gains(scores: Scores, scenes: Sequence[str], missing: Missing) -> Table:
     )
 
 
-def ablation(scores: Scores, lens: Sequence[str]) -> Table:
-    """Table II: the mean over the scenes with drops on the lens, by seed, beside the paper's."""
+def ablation(scores: Scores, lens: Sequence[str], missing: Missing) -> Table:
+    """Table II: the mean over the scenes with drops on the lens, by seed, beside the paper's.
+
+    Of the seeds that every scene has: a mean over two seeds' runs would be no run's.
+    """
     keys = ("unaveraged", "derain", "loop")
     rows = {row.key: row.label for row in ROWS if row.kind == "test"}
     columns = [Column(f"here {n}", "here", *NUMBERS[n]) for n in ("psnr", "ssim", "flip")]
@@ -112,17 +122,17 @@ def ablation(scores: Scores, lens: Sequence[str]) -> Table:
         Column(f"paper {n}", "paper", NUMBERS[n][0], 4, NUMBERS[n][2]) for n in PAPER_METRICS
     ]
     cells: dict[tuple[str, str], Values] = {}
+    gaps = {("loop", column.key): "the paper has no loop" for column in columns[3:]}
     for key in keys:
         for n in ("psnr", "ssim", "flip"):
-            by_scene = [scores.get((scene, key, n), ()) for scene in lens]
-            if lens and all(by_scene):  # seeds that every scene has
-                seeds = min(len(values) for values in by_scene)
-                cells[key, f"here {n}"] = tuple(
-                    mean([values[k] for values in by_scene]) for k in range(seeds)
-                )
+            by_scene = [scores.get((scene, key, n), {}) for scene in lens]
+            seeds = [s for s in next(iter(by_scene), ()) if all(s in some for some in by_scene)]
+            if seeds:
+                cells[key, f"here {n}"] = tuple(mean([some[s] for some in by_scene]) for s in seeds)
+            if any((scene, key) in missing for scene in lens):
+                gaps[key, f"here {n}"] = "not computed, or not for every scene and seed"
         for n, value in zip(PAPER_METRICS, PAPER_ABLATION.get(key, ()), strict=False):
             cells[key, f"paper {n}"] = (value,)
-    gaps = {("loop", column.key): "the paper has no loop" for column in columns[3:]}
     note = f"Here: mean over {', '.join(lens)}. Paper: as printed, mean over Tanabata, Factory and Church."
     lines = tuple(Line(key, rows[key]) for key in keys)
     return Table("ablation", "The mean map (equation 5), drops on the lens", lines, tuple(columns),
@@ -143,11 +153,13 @@ def mask_quality(scores: Scores, scenes: Sequence[str], missing: Missing, covere
     names = {"precision": "precision", "recall": "recall", "iou": "IoU"}
     columns = tuple(Column(f"{s} {n}", s, h, 3) for s in scenes for n, h in names.items())
     cells = {
-        (row, f"{s} {n}"): values
-        for (s, row, n), values in scores.items()
+        (row, f"{s} {n}"): _values(scores, s, row, n)
+        for s, row, n in scores
         if row in labels and n in names
     }
     gaps = {(row, f"{s} {n}"): why for (s, row), why in missing.items() for n in names}
+    # Gathered by the loop's first round.
+    gaps |= {("gathered", place): why for (row, place), why in gaps.items() if row == "loop"}
     lines = tuple(Line(key, label) for key, label in labels.items())
     note = f"A pixel is truly covered when its coverage is above {covered:g}; pixels of all views pooled."
     return Table(
@@ -178,3 +190,8 @@ def pose_quality(poses: Mapping[str, Mapping[str, float]], scenes: Sequence[str]
     )
     lines = tuple(Line(scene, scene, False) for scene in scenes)
     return Table("poses", "Poses", lines, columns, cells, notes=(note,))
+
+
+def _values(scores: Scores, scene: str, row: str, number: str) -> Values:
+    """The values of all seeds that there are."""
+    return tuple(scores.get((scene, row, number), {}).values())

@@ -64,6 +64,7 @@ def best(table: Table, column: Column) -> tuple[str, bool] | None:
     line by more than the spreads; None where nothing competes or fewer than two lines have values.
 
     Lines whose means are equal when printed share no first place: the first of them has it, unclaimed.
+    Nor is anything claimed beside a line with a single value that lacks others: its spread is not known.
     """
     known = [one for one in table.lines if one.competes and table.values(one, column)]
     if column.higher is None or len(known) < 2:
@@ -74,7 +75,8 @@ def best(table: Table, column: Column) -> tuple[str, bool] | None:
         return sign * round(mean(table.values(line, column)), column.digits)
 
     first = max(known, key=printed)
-    ahead = all(
+    partly = [one for one in known if (one.key, column.key) in table.missing]
+    ahead = all(len(table.values(one, column)) > 1 for one in partly) and all(
         printed(first) > printed(one)
         and better_beyond_spread(
             table.values(first, column), table.values(one, column), higher=column.higher
@@ -86,14 +88,27 @@ def best(table: Table, column: Column) -> tuple[str, bool] | None:
 
 
 def gaps(table: Table) -> list[tuple[str, list[str]]]:
-    """Why cells are empty, or lack some of their values, each reason with its cells, as "line, group"."""
-    told: dict[str, list[str]] = {}
+    """Why cells are empty, or lack some of their values, each reason with its cells, as "line, group".
+
+    A line that lacks something in every one of several groups is told once.
+    """
+    groups = list(dict.fromkeys(column.group for column in table.columns))
+    told: dict[str, dict[str, list[str]]] = {}
     for line in table.lines:
         for column in table.columns:
             key = (line.key, column.key)
             if not table.values(line, column) or key in table.missing:
                 why = table.missing.get(key, "not computed")
-                place = f"{line.label}, {column.group}" if column.group else line.label
-                if place not in told.setdefault(why, []):
-                    told[why].append(place)
-    return list(told.items())
+                some = told.setdefault(why, {}).setdefault(line.label, [])
+                if column.group not in some:
+                    some.append(column.group)
+    return [
+        (why, [place for label, some in lines.items() for place in _places(label, some, groups)])
+        for why, lines in told.items()
+    ]
+
+
+def _places(label: str, some: list[str], groups: list[str]) -> list[str]:
+    if len(groups) > 1 and some == groups:
+        return [label]
+    return [f"{label}, {group}" if group else label for group in some]
