@@ -29,12 +29,13 @@ S = TypeVar("S", bound=Section)
 
 
 def read_section(
-    file: Path, name: str, section_type: type[S], scene: str, variant: str | None = None
+    file: Path, name: str, section_type: type[S], scene: str | None, variant: str | None = None
 ) -> S:
     """The validated section `name` of params.yaml for `scene` (and `variant`).
 
     The scene's own values under `scenes.<scene>.<name>` replace the section's, and the variant's under
-    `variants.<variant>.<name>` replace both. UserError lists every unknown, missing or out-of-range key.
+    `variants.<variant>.<name>` replace both. `scene` None: as for one without values of its own.
+    UserError lists every unknown, missing or out-of-range key.
     """
     content = read_params(file)
     merged: dict[str, Any] = {}
@@ -153,12 +154,13 @@ def stage_names() -> list[str]:
 
 
 def _layers(
-    file: Path, content: Mapping[str, Any], name: str, scene: str, variant: str | None
+    file: Path, content: Mapping[str, Any], name: str, scene: str | None, variant: str | None
 ) -> Iterable[tuple[str, Any]]:
     if name not in content:
         raise UserError(f"{file.name}: the section {name} is missing.", CORRECT)
     yield name, content[name] or {}
-    yield f"scenes.{scene}.{name}", _chosen(file, content, "scenes", scene).get(name) or {}
+    if scene is not None:
+        yield f"scenes.{scene}.{name}", _chosen(file, content, "scenes", scene).get(name) or {}
     if variant is not None:
         yield (
             f"variants.{variant}.{name}",

@@ -25,12 +25,11 @@ from pipeline.io.scene import (
 )
 from pipeline.io.transforms import write_transforms
 from pipeline.parallel import map_named
-from pipeline.params import with_scene
+from pipeline.params import read_section, with_scene
 from pipeline.sfm import read_colmap
 from pipeline.stage import Job, Section, run
 
 log = logging.getLogger(__name__)
-FEWEST = 3
 
 
 class Params(Section):
@@ -108,8 +107,10 @@ def _before(params_file: Path, flags: argparse.Namespace) -> None:
     if flags.source is None:
         return
     data = ScenePaths(params_file.parent, flags.scene).data
-    with_scene(params_file, flags.scene)  # what stands against it is told before anything is copied
-    adopt(flags.source, data, FEWEST, read_colmap)
+    # What stands against it is told before anything is copied.
+    known = with_scene(params_file, flags.scene) is None
+    fewest = read_section(params_file, "ingest", Params, flags.scene if known else None).min_images
+    adopt(flags.source, data, fewest, read_colmap)
     text = with_scene(params_file, flags.scene)  # anew: copying takes long, others add scenes too
     if text is not None:
         write_text(params_file, text)

@@ -208,12 +208,35 @@ def test_one_command_brings_a_folder_in(tmp_path: Path) -> None:
     assert (root / "params.yaml").read_text() == after and not (root / "data/shed").exists()
 
 
+def test_as_many_photos_are_asked_for_as_the_scene_needs(tmp_path: Path) -> None:
+    """`ingest.min_images`, on the way in too: of the section, or of a scene that is there already."""
+    for name in "ab":
+        _photo(tmp_path / f"pair/{name}.jpg")
+    file = tmp_path / "params.yaml"
+    text = (ROOT / "params.yaml").read_text()
+    file.write_text(text)
+    with pytest.raises(UserError, match="at least 3"):
+        ingest._before(file, argparse.Namespace(source=tmp_path / "pair", scene="garden"))
+    assert file.read_text() == text and not (tmp_path / "data/garden").exists()
+    fewer = text.replace("min_images: 3 ", "min_images: 2 ")
+    file.write_text(fewer)
+    ingest._before(file, argparse.Namespace(source=tmp_path / "pair", scene="garden"))
+    assert (tmp_path / "data/garden/b.jpg").is_file()
+    file.write_text(
+        text.replace("scenes:\n", "scenes:\n  shed: {<<: *scene, ingest: {min_images: 2}}\n")
+    )
+    ingest._before(file, argparse.Namespace(source=tmp_path / "pair", scene="shed"))
+    assert (tmp_path / "data/shed/b.jpg").is_file()
+
+
 def test_scenes_that_are_added_at_once_do_not_lose_each_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While the photos of one are copied, another finishes and writes its line."""
     file = tmp_path / "params.yaml"
-    file.write_text("scene_defaults: &scene {ingest: {}}\nscenes:\n  demo: {<<: *scene}\n")
+    section = "ingest: {max_size: 0, min_images: 3, holdout: 0, frames: 9, mixed_sizes: scale}\n"
+    scenes = "scene_defaults: &scene {ingest: {}}\nscenes:\n  demo: {<<: *scene}\n"
+    file.write_text(section + scenes)
 
     def adopt(*_: object) -> None:
         file.write_text(file.read_text() + "  pier: {<<: *scene}\n")
