@@ -76,7 +76,23 @@ def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
             overrides = _mapping(file, f"{kind}.{name}", values or {})
             allowed = [*stage_names(), *([FOLDERS] if kind == "variants" else [])]
             _refuse_unknown(file, f"section in {kind}.{name}", overrides, allowed)
+    _refuse_unfollowed(file, content)
     return content
+
+
+def _refuse_unfollowed(file: Path, content: Mapping[str, Any]) -> None:
+    """UserError for a comparison of a variant with `folders`: dvc.yaml follows its scene's, not these."""
+    pairs = _mapping(file, "comparisons", content.get("comparisons") or {})
+    for name, pair in pairs.items():
+        variant = str(_mapping(file, f"comparisons.{name}", pair).get("variant"))
+        elsewhere = ((content.get("variants") or {}).get(variant) or {}).get(FOLDERS)
+        if elsewhere:
+            which = ", ".join(_mapping(file, f"variants.{variant}.{FOLDERS}", elsewhere))
+            raise UserError(
+                f"{file.name}: comparisons.{name}: {variant} finds its {which} in folders that dvc.yaml "
+                "does not follow.",
+                "Leave it out of comparisons: and run its stages with --variant.",
+            )
 
 
 def _upon(file: Path, below: dict[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

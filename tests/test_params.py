@@ -34,6 +34,12 @@ masks: {threshold: 3e-1, temporal_mean: on, dilation: 2}
 """
 
 
+COMPARED = (
+    GOOD.replace("variants:", "variants:\n  far: {folders: {images: a/b, refine: c}}")
+    + "comparisons:\n  demo-far: {scene: demo, variant: far}\n"
+)
+
+
 def _file(tmp_path: Path, text: str = GOOD) -> Path:
     path = tmp_path / "params.yaml"
     path.write_text(text)
@@ -78,12 +84,29 @@ def test_every_problem_is_told_at_once_with_the_nearest_name(tmp_path: Path) -> 
         ("scenes: {demo: {}}", "the section masks is missing"),
         ("scenes: {demo: {}}\nmasks: 3", "key: value"),
         ("masks: {threshold: 2026-99-99}", "not valid YAML: month must be"),
+        (
+            COMPARED,
+            "demo-far: far finds its images, refine in folders that dvc.yaml does not follow",
+        ),
+        (
+            COMPARED.replace("{images: a/b, refine: c}", "3"),
+            "variants.far.folders should hold key: value",
+        ),
+        (
+            COMPARED.replace("{scene: demo, variant: far}", "far"),
+            "comparisons.demo-far should hold key",
+        ),
         ("[" * 20_000, "not valid YAML"),
     ],
 )
 def test_faults_of_the_file_are_sentences(tmp_path: Path, text: str, sentence: str) -> None:
     with pytest.raises(UserError, match=sentence.replace("?", r"\?")):
         read_section(_file(tmp_path, text), "masks", Masks, "demo")
+
+
+def test_a_variant_with_folders_is_fine_where_nothing_compares_it(tmp_path: Path) -> None:
+    text = COMPARED.replace("variant: far", "variant: wide")
+    assert read_section(_file(tmp_path, text), "masks", Masks, "demo", "far").dilation == 2
 
 
 def test_an_unknown_scene_names_the_nearest(tmp_path: Path) -> None:
