@@ -15,7 +15,7 @@ from pipeline.evaluation.references import find_references
 from pipeline.evaluation.rounds import score_rounds
 from pipeline.evaluation.score import Files, score_image
 from pipeline.evaluation.summary import as_csv, conventions, headline, summarise
-from pipeline.io.atomic import write_json, write_text
+from pipeline.io.atomic import write_with_json
 from pipeline.io.scene import ImageRecord, read_images_json
 from pipeline.io.transforms import read_transforms
 from pipeline.parallel import map_named
@@ -57,8 +57,7 @@ def main(job: Job, params: Params) -> str:
     metrics["rounds"] = score_rounds(paths.refine, files, params.coverage_threshold)
     metrics["conventions"] = conventions(params.coverage_threshold)
     table = {record.name: {"split": record.split, **rows[record.name]} for record in records}
-    write_text(paths.metrics_csv, as_csv(table))
-    write_json(paths.metrics, metrics)
+    write_with_json(paths.metrics_csv, as_csv(table), paths.metrics, metrics)
     return headline(metrics)
 
 

@@ -125,8 +125,9 @@ def _swap(fresh: Path, final: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Writes `data` to `path`: beside it first, flushed to disk, then renamed."""
+@contextmanager
+def _beside(path: Path, data: bytes) -> Iterator[Path]:
+    """Yields a file beside `path` that holds `data`, flushed to disk; it is gone afterwards if not renamed."""
     with disk_faults(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.parent / f".{path.name}.tmp-{os.getpid()}"
@@ -135,14 +136,34 @@ def write_bytes(path: Path, data: bytes) -> None:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            fresh.replace(path)
+            yield fresh
         finally:
             fresh.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `data` to `path`: beside it first, flushed to disk, then renamed."""
+    with _beside(path, data) as fresh:
+        fresh.replace(path)
 
 
 def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 `text` to `path`, whole or not at all."""
     write_bytes(path, text.encode())
+
+
+def write_with_json(path: Path, text: str, json_path: Path, content: Any) -> None:
+    """Writes UTF-8 `text` and a JSON that belong together: where the JSON is, the text is of the same run.
+
+    A kill may leave both old, both new, or no JSON.
+    """
+    with (
+        _beside(path, text.encode()) as fresh,
+        _beside(json_path, _as_json(content).encode()) as fresh_json,
+    ):
+        json_path.unlink(missing_ok=True)
+        fresh.replace(path)
+        fresh_json.replace(json_path)
 
 
 def write_npy(path: Path, values: np.ndarray) -> None:
@@ -161,7 +182,11 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[float 
 
 def write_json(path: Path, content: Any) -> None:
     """Writes `content` as JSON with sorted keys; raises ValueError on NaN or infinity."""
-    write_text(path, json.dumps(content, indent=2, sort_keys=True, allow_nan=False) + "\n")
+    write_text(path, _as_json(content))
+
+
+def _as_json(content: Any) -> str:
+    return json.dumps(content, indent=2, sort_keys=True, allow_nan=False) + "\n"
 
 
 def read_json(path: Path, made_by: str = "", shape: Shape = dict[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pipeline.io.atomic import (
     read_json,
     write_bytes,
     write_json,
+    write_with_json,
 )
 
 
@@ -103,3 +104,43 @@ def test_a_folder_above_that_takes_nothing_is_called_unwritable() -> None:
     told = pytest.raises(UserError, match=r"/a: cannot be written \(Read-only file system\)")
     with told, disk_faults(Path("/a/b/c/d")):
         raise OSError(errno.EROFS, "Read-only file system", "/a")
+
+
+class Killed(BaseException):
+    """What nothing catches."""
+
+
+@pytest.mark.parametrize("renames", [0, 1, 2])
+def test_a_text_and_its_json_are_of_one_run_wherever_it_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renames: int
+) -> None:
+    text, about = tmp_path / "metrics.csv", tmp_path / "metrics.json"
+    write_with_json(text, "old", about, {"run": "old"})
+    real, done = Path.replace, []
+
+    def replace(self: Path, target: Path) -> Path:
+        if len(done) == renames:
+            raise Killed
+        done.append(target)
+        return real(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", replace)
+        if renames < 2:
+            with pytest.raises(Killed):
+                write_with_json(text, "new", about, {"run": "new"})
+        else:
+            write_with_json(text, "new", about, {"run": "new"})
+    assert not about.exists() or read_json(about)["run"] == text.read_text()
+    write_with_json(text, "new", about, {"run": "new"})
+    assert (text.read_text(), read_json(about)) == ("new", {"run": "new"})
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_json_that_cannot_be_written_leaves_both_files_as_they_were(tmp_path: Path) -> None:
+    text, about = tmp_path / "metrics.csv", tmp_path / "metrics.json"
+    write_with_json(text, "old", about, {"run": "old"})
+    with pytest.raises(ValueError):
+        write_with_json(text, "new", about, {"run": float("nan")})
+    assert (text.read_text(), read_json(about)) == ("old", {"run": "old"})
+    assert len(list(tmp_path.iterdir())) == 2
