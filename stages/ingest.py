@@ -107,8 +107,7 @@ def _before(params_file: Path, flags: argparse.Namespace) -> None:
     if flags.source is None:
         return
     data = ScenePaths(params_file.parent, flags.scene).data
-    # What stands against it is told before anything is copied.
-    known = with_scene(params_file, flags.scene) is None
+    known = with_scene(params_file, flags.scene) is None  # faults are told before photos are copied
     fewest = read_section(params_file, "ingest", Params, flags.scene if known else None).min_images
     adopt(flags.source, data, fewest, read_colmap)
     text = with_scene(params_file, flags.scene)  # anew: copying takes long, others add scenes too
