@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import shutil
 from pathlib import Path
@@ -102,8 +100,7 @@ def main(job: Job, params: Params) -> str:
     if params.radius_mm[0] > params.radius_mm[1]:
         raise UserError("synthesize.radius_mm should be [smallest, largest].")
     recipe = params.model_dump(mode="json")
-    key = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
-    work = job.paths.work("synthesize") / key
+    work = job.paths.work("synthesize") / storing.work_key(recipe)
     make = _rendered
     if params.mode == "paint":
         shutil.rmtree(work, ignore_errors=True)  # what an interrupted run made of photos now gone

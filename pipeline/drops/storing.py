@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from contextlib import suppress
 from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +34,20 @@ def encode(path: Path, image: np.ndarray, quality: int | None = None) -> None:
         raise OSError(f"{path}: the image could not be encoded")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, data.tobytes())
+
+
+def work_key(recipe: Recipe, code: Path = Path(__file__).parent) -> str:
+    """A name for the views that a recipe makes with this code and this Mitsuba.
+
+    An interrupted scene goes on among views of that name alone: none by older code stays beside new ones.
+    """
+    digest = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode())
+    with suppress(PackageNotFoundError):  # photos are painted without it
+        digest.update(version("mitsuba").encode())
+    for file in sorted(code.glob("*.py")):
+        digest.update(file.name.encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def stems(count: int) -> dict[str, int]:

@@ -286,6 +286,17 @@ def test_stage_renders_resumes_and_repeats_itself(
     assert len(list_photos(data, 1)) == 2 and len(list(data.glob("truth/depth/*.exr"))) == 2
 
 
+def test_views_of_other_code_or_another_recipe_are_not_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "shape.py").write_text("FACTOR = 1\n")
+    first = storing.work_key(RECIPE, tmp_path)
+    assert storing.work_key(dict(reversed(RECIPE.items())), tmp_path) == first
+    assert storing.work_key(RECIPE | {"seed": 1 + RECIPE["seed"]}, tmp_path) != first
+    (tmp_path / "shape.py").write_text("FACTOR = 2\n")
+    assert storing.work_key(RECIPE, tmp_path) != first
+    (tmp_path / "shape.py").write_text("FACTOR = 1\n")
+    assert storing.work_key(RECIPE, tmp_path) == first
+
+
 def test_the_demo_is_whole() -> None:
     data = Path(__file__).resolve().parents[2] / "data/demo"
     stems = sorted(p.stem for p in data.glob("*.jpg"))
