@@ -10,11 +10,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.masking.glass import GlassCamera, PaneGlass
+from pipeline.masking.glass import Glass, GlassCamera, PaneGlass
 from pipeline.masking.seek import Seeker, Wish, cover, describe, shown
 from pipeline.masking.sweep import Found
 from pipeline.masking.views import RedrawnViews, attention_on_glass, changed_share, redraw_views
-from pipeline.masking.window import alike_by_distance, chosen_window
+from pipeline.masking.window import alike_by_distance, alike_on_pane, chosen_window
 
 log = logging.getLogger(__name__)
 
@@ -74,13 +74,12 @@ def repair(
     pixels change, and keeps the masks that it had when the residual shows no glass, when it agrees
     there less than is needed to add to the attention (a poor field disagrees everywhere), or when the
     disagreement inside the new masks is not `contrast` times that outside. `window` auto: see
-    `chosen_window`, for drops on the lens; on a pane, where the views are moved until they cover each
-    other and few share a place, all views are gathered. Other parameters as in `redraw_views`.
+    `chosen_window`. Other parameters as in `redraw_views`.
     """
     told = attentions if use_attention else None
     seeker = Seeker(cameras, farthest, agreement, mode)
     found, glass = seeker.first(attentions)
-    width = _width(window, found, attentions, cameras)
+    width = _width(window, found, glass, attentions, cameras)
     masks, doubt = list(drop_masks), ""
     if use_attention and isinstance(glass, PaneGlass) and (c := cover(glass, attentions)) < STEADY:
         doubt = f"the views do not cover each other well enough on the pane ({c:.2f})"
@@ -95,7 +94,8 @@ def repair(
         if doubt := _doubt(found, use_attention):
             break
         if told is None or found.mode != done[-1].found.mode:  # else the same maps tell the same
-            width = _width(window, found, residuals if told is None else told, cameras)
+            maps = residuals if told is None else told
+            width = _width(window, found, glass, maps, cameras)
         redrawn = redrawn_on(glass, residuals, old, width=width)
         if doubt := _faint(redrawn.contrast, contrast):
             break
@@ -111,12 +111,15 @@ def repair(
 def _width(
     window: Window,
     found: Found,
+    glass: Glass,
     maps: Sequence[np.ndarray | None],
     cameras: Sequence[GlassCamera],
 ) -> int:
-    """The window in photos, 0 for all; auto looks how far apart `maps` still agree on the lens."""
+    """The window in photos, 0 for all; auto looks how far apart `maps` still agree on the glass."""
     if window != "auto":
         return window
+    if isinstance(glass, PaneGlass):
+        return chosen_window(alike_on_pane(glass, maps))
     return chosen_window(alike_by_distance(maps, cameras)) if found.mode == "lens" else 0
 
 

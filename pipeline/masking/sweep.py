@@ -117,13 +117,21 @@ def find_glass(
 
 def agreement_on(glass: PaneGlass, maps: Sequence[np.ndarray | None]) -> float:
     """How well the views' maps agree on a pane as it stands, the views where `glass.moved` has them."""
+    return agreement(stack_on(glass, maps))
+
+
+def stack_on(glass: PaneGlass, maps: Sequence[np.ndarray | None]) -> np.ndarray:
+    """(V, rows, columns): the maps of the views that have one, on fewer cells of a pane as it stands.
+
+    Without broad gradients, the views where `glass.moved` has them; NaN where one does not see a cell.
+    """
     known = [view for view, values in enumerate(maps) if values is not None]
     fine, cameras = prepared(
         [values for values in maps if values is not None], [glass.cameras[v] for v in known], FINE
     )
     own = PaneGlass(glass.pane_from_world, cameras, max_cells=3 * fine[0].size)
     own.moved = glass.moved[known]
-    return agreement(_stack(own, fine))
+    return _stack(own, fine)
 
 
 def _sweep(

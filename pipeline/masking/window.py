@@ -6,12 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.masking.glass import GlassCamera
-from pipeline.masking.sweep import FINE, prepared
+from pipeline.masking.glass import GlassCamera, PaneGlass
+from pipeline.masking.sweep import FINE, prepared, stack_on
 
 HOLDS = 0.9  # of the agreement of neighbours: less is not the same place any more
 NEIGHBOURS = 0.5  # agreement of neighbours from which their order means something
 FEWEST_PHOTOS = 8  # fewer show no trend
+LEAST_SHARED = 0.05  # of what a photo sees of a pane: photos that share less of it say nothing
+FEWEST_PAIRS = 12  # of photos that share so much
+SURE = 3.0  # standard errors by which likeness must fall with the distance in order
+OWN_WAY = 1.0  # photos by which distances in order must differ at equal overlap
 
 
 def alike_by_distance(
@@ -35,13 +39,52 @@ def alike_by_distance(
     return found
 
 
+def alike_on_pane(glass: PaneGlass, maps: Sequence[np.ndarray | None]) -> np.ndarray:
+    """How alike maps are on a pane that lie 1, 2, ... apart in their order, were their overlap the same.
+
+    Photos far apart in order mostly look at the pane from other places as well, and agree less for that
+    alone: see `at_equal_overlap`, of all pairs that share a place. Up to the farthest apart of these.
+    """
+    known = np.flatnonzero([values is not None for values in maps])
+    flat = stack_on(glass, maps).reshape(len(known), -1)
+    seen = np.isfinite(flat).astype(np.float32)
+    shared = seen @ seen.T
+    shared /= max(float(np.diag(shared).mean()), 1.0)
+    pairs = np.triu_indices(len(known), 1)
+    alike, overlap = _correlations(flat)[pairs], shared[pairs]
+    apart = known[pairs[1]] - known[pairs[0]]
+    used = (overlap >= LEAST_SHARED) & np.isfinite(alike)
+    return at_equal_overlap(alike[used], apart[used], overlap[used])
+
+
+def at_equal_overlap(alike: np.ndarray, apart: np.ndarray, overlap: np.ndarray) -> np.ndarray:
+    """The likeness of photos 1, 2, ... apart in order, of pairs (N,) with their overlap: a straight line.
+
+    Likeness is fitted by a constant, the overlap and the distance in order, pairs with more overlap
+    weighing more; the line is that of the mean overlap. It is level where the fall with the order is not
+    `SURE`, or where the order goes with the place, as on a walk along the pane: nobody can tell then.
+    Empty of too few pairs.
+    """
+    if len(alike) < FEWEST_PAIRS:
+        return np.zeros(0)
+    weights = overlap / overlap.sum()
+    left, own_way = (_without(overlap, values, weights) for values in (alike, apart))
+    spread = max(float(weights @ own_way**2), 1e-12)
+    fall = float(weights @ (left * own_way)) / spread
+    error = float(weights @ (left - fall * own_way) ** 2) / (len(alike) - 3) / spread
+    if spread < OWN_WAY**2 or fall + SURE * error**0.5 > 0:
+        fall = 0.0
+    near = float(weights @ alike) - fall * float(weights @ apart)
+    return near + fall * np.arange(1, int(apart.max()) + 1)
+
+
 def chosen_window(alike: np.ndarray) -> int:
     """Over how many neighbouring photos drops stay in place, odd; 0: over all of them.
 
-    `alike` as from `alike_by_distance`. Drops that stay, and photos without order, are as alike far apart
-    as side by side; where neighbours hardly agree, order means nothing. Where photos in the farther half
-    of the distances agree less than `HOLDS` of what neighbours do, the window is as wide as photos in it
-    still agree to that.
+    `alike` as from `alike_by_distance` or `alike_on_pane`. Drops that stay, and photos without order, are
+    as alike far apart as side by side; where neighbours hardly agree, order means nothing. Where photos in
+    the farther half of the distances agree less than `HOLDS` of what neighbours do, the window is as wide
+    as photos in it still agree to that.
     """
     count = len(alike) + 1
     if count < FEWEST_PHOTOS or not alike[0] >= NEIGHBOURS:  # NaN too
@@ -53,6 +96,12 @@ def chosen_window(alike: np.ndarray) -> int:
     first_less = int(np.flatnonzero(alike < least)[0]) + 1
     width = 2 * (first_less // 2) + 1
     return width if width < count else 0
+
+
+def _without(overlap: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """What a constant and `overlap` leave of `values` (N,), fitted with `weights` that add up to 1."""
+    off, other = overlap - weights @ overlap, values - weights @ values
+    return other - float(weights @ (off * other)) / max(float(weights @ off**2), 1e-12) * off
 
 
 def _correlations(flat: np.ndarray) -> np.ndarray:

@@ -1,12 +1,20 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.masking.account import account
-from pipeline.masking.glass import GlassCamera
+from pipeline.masking.align import aligned
+from pipeline.masking.glass import GlassCamera, PaneGlass, pane_before
 from pipeline.masking.loop import repair
-from pipeline.masking.window import alike_by_distance, chosen_window
+from pipeline.masking.views import attention_on_glass
+from pipeline.masking.window import (
+    alike_by_distance,
+    alike_on_pane,
+    at_equal_overlap,
+    chosen_window,
+)
 
 WIDTH, HEIGHT, COUNT = 120, 90, 16
 
@@ -95,3 +103,76 @@ def test_the_loop_goes_by_the_window_that_it_chose() -> None:
         return sum((a & b).sum() for a, b in pairs) / sum((a | b).sum() for a, b in pairs)
 
     assert overlap("auto") > overlap(0) + 0.1
+
+
+# Photos in four rows of six before a pane, to and fro: neighbours in a row and below each other share half.
+PLACES = [(30 * (k % 6 if k // 6 % 2 == 0 else 5 - k % 6), 24 * (k // 6)) for k in range(24)]
+
+
+def _before_a_pane(px_per_photo: float) -> tuple[PaneGlass, list[np.ndarray], list[np.ndarray]]:
+    """A pane, where drops are in each view of 60x48, and its attention, which errs in its own way.
+
+    The largest drops creep down by `px_per_photo`, the others in proportion to the square of their radius.
+    """
+    rng, width, height, focal, away = np.random.default_rng(3), 60, 48, 60.0, 1.5
+    middles, radii = rng.uniform(0, (210, 140), (160, 2)), rng.uniform(3, 7, 160)
+    cameras, truth, maps = [], [], []
+    for view, (left, top) in enumerate(PLACES):
+        pose = np.eye(4)
+        pose[:2, 3] = -np.array([left, top]) * away / focal
+        cameras.append(GlassCamera(pose, (focal, focal, width / 2, height / 2, 0), width, height))
+        wet = np.zeros((height, width), np.uint8)
+        for (x, y), radius in zip(middles, radii, strict=True):
+            y += px_per_photo * view * (radius / 7) ** 2
+            spot = (round(16 * (x - left)), round(16 * (y - top)))
+            cv2.circle(wet, spot, round(16 * radius), 1, -1, shift=4)
+        truth.append(wet > 0)
+        blurred = cv2.GaussianBlur(0.9 * wet.astype(np.float32), (0, 0), 1.0)
+        maps.append(np.clip(blurred + 0.2 * rng.random(wet.shape), 0, 1).astype(np.float32))
+    poses = np.stack([camera.cam_from_world for camera in cameras])
+    return PaneGlass(pane_before(poses, away), cameras), truth, maps
+
+
+def _window_of(glass: PaneGlass, maps: list[np.ndarray], order: np.ndarray) -> int:
+    """The window of photos in another order, once they are brought to cover."""
+    own = PaneGlass(glass.pane_from_world, [glass.cameras[view] for view in order])
+    mixed = [maps[view] for view in order]
+    own.moved = aligned(own, mixed, 4)
+    return chosen_window(alike_on_pane(own, mixed))
+
+
+def test_drops_that_creep_down_a_pane_get_a_window_and_others_none() -> None:
+    in_order, mixed = np.arange(24), np.random.default_rng(1).permutation(24)
+    for px_per_photo in (0.0, 1.2):
+        glass, _, maps = _before_a_pane(px_per_photo)
+        assert (_window_of(glass, maps, in_order) > 0) == (px_per_photo > 0)
+        assert _window_of(glass, maps, mixed) == 0
+
+
+def test_a_window_on_a_pane_follows_drops_that_creep() -> None:
+    glass, truth, maps = _before_a_pane(1.2)
+    glass.moved = aligned(glass, maps, 4)
+    drawn = [seen > 0.5 for seen in maps]
+
+    def overlap(width: int) -> float:
+        pairs = list(zip(attention_on_glass(glass, maps, drawn, width), truth, strict=True))
+        return sum((a & b).sum() for a, b in pairs) / sum((a | b).sum() for a, b in pairs)
+
+    assert overlap(chosen_window(alike_on_pane(glass, maps))) > overlap(0) + 0.02
+
+
+def test_a_fall_with_the_overlap_is_none_with_the_order() -> None:
+    rng = np.random.default_rng(0)
+    apart = rng.integers(1, 14, 60)
+    # Photos farther apart share less, and photos that share less agree less: the pane is still.
+    overlap = np.clip(0.8 - 0.04 * apart + rng.normal(0, 0.1, 60), 0.05, 1)
+    still = 0.7 + 0.3 * overlap + rng.normal(0, 0.01, 60)
+    level = at_equal_overlap(still, apart, overlap)
+    assert len(level) == apart.max() and np.ptp(level) == 0
+    line = at_equal_overlap(still - 0.02 * (apart - 1), apart, overlap)
+    assert np.diff(line) == pytest.approx(-0.02, abs=0.002)
+    assert chosen_window(line) > 0 and chosen_window(level) == 0
+    # On a walk along the pane the overlap tells the order: what falls with one falls with the other.
+    walk = 0.8 - 0.04 * apart
+    assert np.ptp(at_equal_overlap(0.9 - 0.02 * apart, apart, walk)) == 0
+    assert chosen_window(at_equal_overlap(still[:5], apart[:5], overlap[:5])) == 0
