@@ -10,20 +10,12 @@ import cv2
 import numpy as np
 
 from pipeline.drops import places_harbour, places_room, places_street
-from pipeline.drops.places_parts import Array, Builder, TexturedMesh
+from pipeline.drops.places_parts import Array, Builder, Lamp, TexturedMesh
 from pipeline.drops.places_textures import noise
 from pipeline.errors import UserError
 
 Rng = np.random.Generator
 SKY_HEIGHT = 256
-
-
-@dataclass(frozen=True)
-class Lamp:
-    """A point light: position (3,) in metres; radiant intensity (3,) in W/sr, linear RGB."""
-
-    position: tuple[float, float, float]
-    intensity: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -94,7 +86,7 @@ def _room(rng: Rng) -> tuple[Builder, dict[str, object]]:
     sky = clear_sky(rng, np.array([0.5, 0.7, 1.0]) * 1.6, np.array([0.9, 0.95, 1.0]) * 1.9,
                     np.array([1, 1, 1.0]) * 2.2, cover=0.5)  # fmt: skip
     return b, {"sky": sky, "sun": sun, "irradiance": np.array([1, 0.93, 0.8]) * 5,
-               "lamps": [Lamp(*lamp) for lamp in lamps]}  # fmt: skip
+               "lamps": lamps}  # fmt: skip
 
 
 def _harbour(rng: Rng) -> tuple[Builder, dict[str, object]]:
@@ -103,7 +95,7 @@ def _harbour(rng: Rng) -> tuple[Builder, dict[str, object]]:
     sky = clear_sky(rng, np.array([0.05, 0.09, 0.22]) * tone, np.array([0.62, 0.34, 0.22]) * tone,
                     np.array([0.40, 0.26, 0.28]) * tone, cover=rng.uniform(0.3, 0.5))  # fmt: skip
     return b, {"sky": sky, "sun": [0.3, -0.1, 1.0], "irradiance": np.zeros(3),
-               "lamps": [Lamp(*lamp) for lamp in lamps], "grey": 0.10}  # fmt: skip
+               "lamps": lamps, "grey": 0.10}  # fmt: skip
 
 
 _PLACES: dict[str, Callable[[Rng], tuple[Builder, dict[str, object]]]] = {

@@ -8,12 +8,10 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.drops import places_textures as tx
-from pipeline.drops.places_parts import Array, Builder, offset, turn
+from pipeline.drops.places_parts import UP, Array, Builder, Lamp, lamp, offset, turn
 from pipeline.drops.places_things import at, bench, bin_, cell, notice, planter, railing
 
 Rng = np.random.Generator
-LampPair = tuple[tuple[float, float, float], tuple[float, float, float]]
-UP = np.array([0, -1, 0], np.float32)
 RIGHT = np.array([1, 0, 0], np.float32)
 WATER = -1.1  # height of the water below the quay's ground, metres
 SHORE = 34.0  # distance of the far shore
@@ -115,10 +113,8 @@ def wheelhouse(
         )  # fmt: skip
 
 
-def boat(
-    b: Builder, rng: Rng, middle: Array, yaw: float, long: float, lamps: list[LampPair]
-) -> None:
-    """Fishing boat afloat: hull, wheelhouse, mast with a boom, rigging and pennants."""
+def boat(b: Builder, rng: Rng, middle: Array, yaw: float, long: float, lamps: list[Lamp]) -> None:
+    """Fishing boat afloat: hull, wheelhouse, mast, rigging, pennants; a lantern that is lit joins `lamps`."""
     me = _Afloat(middle, turn(yaw), long, long * float(rng.uniform(0.26, 0.32)))
     free = long * float(rng.uniform(0.13, 0.17))
     colour = np.asarray(HULLS[int(rng.integers(len(HULLS)))])
@@ -143,12 +139,11 @@ def boat(
     if lit:
         lantern = top - UP * 0.25 * tall - offset(0, 0, 0.1)
         b.ball("paint", lantern, np.full(3, 0.07), glow=2.0, tint=(1, 0.85, 0.6), sides=8)
-        x, y, z = (float(c) for c in lantern - offset(0, 0, 0.2))
-        lamps.append(((x, y, z), (1.4, 1.1, 0.7)))
+        lamps.append(lamp(lantern - offset(0, 0, 0.2), (1.4, 1.1, 0.7)))
 
 
-def quay_lamp(b: Builder, rng: Rng, foot: Array, lamps: list[LampPair]) -> Array:
-    """Lit lamp on a curved iron post; returns where its lantern hangs."""
+def quay_lamp(b: Builder, rng: Rng, foot: Array, lamps: list[Lamp]) -> Array:
+    """Where the lantern of a lamp on a curved iron post hangs; its light joins `lamps`."""
     h = float(rng.uniform(2.5, 3.0))
     way = float(rng.choice([-1.0, 1.0]))
     b.lathe("metal", foot, [(0.06, 0.7), (0.09, 0.5), (0.13, 0.2), (0.16, 0.0)], sides=10)
@@ -158,8 +153,7 @@ def quay_lamp(b: Builder, rng: Rng, foot: Array, lamps: list[LampPair]) -> Array
     head = bow[-1].astype(np.float32)
     b.lathe("metal", head - UP * 0.12, [(0.02, 0.16), (0.10, 0.10), (0.20, 0.0)], sides=12)
     b.ball("paint", head - UP * 0.16, np.full(3, 0.10), glow=2.5, tint=(1.0, 0.80, 0.50), sides=12)
-    x, y, z = (float(c) for c in head - UP * 0.32)
-    lamps.append(((x, y, z), (5.2, 3.7, 2.0)))
+    lamps.append(lamp(head - UP * 0.32, (5.2, 3.7, 2.0)))
     return head
 
 
@@ -324,10 +318,10 @@ def surroundings(b: Builder, rng: Rng) -> None:
         b.sheet("hill", rows, tile=9.0, tint=(1.0, 1.05, 1.25) if depth > 60 else (1, 1, 1))
 
 
-def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
-    """A quay, laid out at random, and its lamps as (position, intensity)."""
+def build(rng: Rng) -> tuple[Builder, list[Lamp]]:
+    """A quay, laid out at random, and its lamps."""
     b = Builder(textures(rng), step=0.2)
-    lamps: list[LampPair] = []
+    lamps: list[Lamp] = []
     surroundings(b, rng)
     places = rng.permutation(np.linspace(-5.2, 5.2, 4))
     for k in range(3):

@@ -15,6 +15,15 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]  # float32 where it is stored
 Vec = npt.ArrayLike
 WHITE = (1.0, 1.0, 1.0)
+UP = np.array([0, -1, 0], np.float32)
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A point light: position (3,) in metres; radiant intensity (3,) in W/sr, linear RGB."""
+
+    position: tuple[float, float, float]
+    intensity: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -57,17 +66,30 @@ def offset(x: float, y: float, z: float) -> npt.NDArray[np.float64]:
     return np.array([x, y, z], np.float64)
 
 
+def lamp(position: Array, intensity: tuple[float, float, float]) -> Lamp:
+    """The lamp at that position (3,)."""
+    x, y, z = (float(c) for c in position)
+    return Lamp((x, y, z), intensity)
+
+
 def turn(yaw: float) -> Array:
     """Rotation (3, 3) by `yaw` radians about the vertical; positive turns +z towards +x."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], np.float32)
 
 
+def front(right: Array) -> tuple[Array, Array, float]:
+    """Out of a front along the unit `right`, up, and its angle about the vertical."""
+    out = np.cross(np.array([0, 1, 0], np.float32), right)
+    return out, UP, float(np.arctan2(-right[2], right[0]))
+
+
 def _unit(v: Array) -> Array:
     return (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)).astype(np.float32)
 
 
-def _grid_faces(rows: int, columns: int) -> npt.NDArray[np.uint32]:
+def grid_faces(rows: int, columns: int) -> npt.NDArray[np.uint32]:
+    """Triangles (M, 3) between the points of a grid, row by row, seen from outside."""
     index = np.arange(rows * columns, dtype=np.uint32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     both = np.stack([np.stack([a, c, b], -1), np.stack([a, d, c], -1)], 2)
@@ -111,7 +133,7 @@ class Builder:
         normal = np.broadcast_to(np.cross(b, a), (na * nb, 3))
         uv = np.hstack([s, t]).astype(np.float32)
         uv = cell.apply(uv) if cell else uv * [la / tile, lb / tile] + np.asarray(shift)
-        self.add(material, o + s * a + t * b, normal, uv, _grid_faces(nb, na), tint, glow)
+        self.add(material, o + s * a + t * b, normal, uv, grid_faces(nb, na), tint, glow)
 
     def sheet(
         self, material: str, points: Vec, *, tile: float = 1.0, tint: Vec = WHITE, glow: float = 0.0
@@ -125,7 +147,7 @@ class Builder:
         run = [np.cumsum(np.linalg.norm(d, axis=2), axis=a) for d, a in ((right, 1), (down, 0))]
         uv = np.stack(run, -1) / tile
         normals = np.cross(down, right)
-        self.add(material, p, normals, uv, _grid_faces(*p.shape[:2]), tint, glow)
+        self.add(material, p, normals, uv, grid_faces(*p.shape[:2]), tint, glow)
 
     def box(
         self, material: str, centre: Vec, size: Vec, *, yaw: float = 0.0, tile: float = 1.0,
@@ -167,7 +189,7 @@ class Builder:
         length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
         turnings = np.broadcast_to(np.linspace(0, 1, sides + 1), n.shape[:2])
         uv = np.stack([turnings, np.broadcast_to(length[:, None] / tile, n.shape[:2])], -1)
-        self.add(material, p[:, None] + r * n, n, uv, _grid_faces(len(p), sides + 1), tint, glow)
+        self.add(material, p[:, None] + r * n, n, uv, grid_faces(len(p), sides + 1), tint, glow)
 
     def lathe(
         self, material: str, foot: Vec, profile: Vec, *, sides: int = 12, tint: Vec = WHITE,
@@ -183,7 +205,7 @@ class Builder:
         u, w = np.meshgrid(angle / (2 * np.pi), np.linspace(0, 1, len(radius)))
         uv = np.stack([u * tile[0], w * tile[1]], -1)
         self.add(
-            material, np.asarray(foot) + v, n, uv, _grid_faces(len(radius), sides + 1), tint, glow
+            material, np.asarray(foot) + v, n, uv, grid_faces(len(radius), sides + 1), tint, glow
         )
 
     def ball(self, material: str, centre: Vec, radii: Vec, *, sides: int = 10, tint: Vec = WHITE,
@@ -198,7 +220,7 @@ class Builder:
         uv = np.stack([phi / (2 * np.pi) * tile[0], theta / np.pi * tile[1]], -1)
         r = np.asarray(radii, np.float32)
         self.add(
-            material, np.asarray(centre) + n * r, n / r, uv, _grid_faces(*n.shape[:2]), tint, glow
+            material, np.asarray(centre) + n * r, n / r, uv, grid_faces(*n.shape[:2]), tint, glow
         )
 
     def leaves(

@@ -5,15 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.drops import places_textures as tx
-from pipeline.drops.places_parts import Array, Builder, Cell, offset, turn
+from pipeline.drops.places_parts import (
+    UP,
+    Array,
+    Builder,
+    Cell,
+    Lamp,
+    front,
+    grid_faces,
+    lamp,
+    offset,
+    turn,
+)
 from pipeline.drops.places_things import at, cell, planter, tree
 
 Rng = np.random.Generator
-LampPair = tuple[tuple[float, float, float], tuple[float, float, float]]
-
-
-def _xyz(point: Array) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])
 
 
 def textures(rng: Rng) -> dict[str, Array]:
@@ -40,57 +46,39 @@ def textures(rng: Rng) -> dict[str, Array]:
 
 def shelf(b: Builder, rng: Rng, left: Array, right: Array, width: float, height: float) -> None:
     """Bookcase from its ground-left corner along the unit `right`, filled with books and things."""
-    out = np.cross(np.array([0, 1, 0], np.float32), right)
-    yaw = float(np.arctan2(-right[2], right[0]))
-    up = np.array([0, -1, 0], np.float32)
+    out, up, yaw = front(right)
     deep = 0.32
     tint = rng.uniform(0.6, 1.2) * np.ones(3)
-    middle = left + right * width / 2
-    b.panel(
-        "wood",
-        left + up * height + out * 0.02,
-        right * width,
-        -up * height,
-        tile=0.9,
-        tint=tint * 0.8,
-    )
+    back = left + up * height + out * 0.02
+    b.panel("wood", back, right * width, -up * height, tile=0.9, tint=tint * 0.8)
     for x in (0.0, width):
-        b.box(
-            "wood",
-            left + right * x + up * height / 2 + out * deep / 2,
-            (0.04, height, deep),
-            yaw=yaw,
-            tint=tint,
-            tile=0.8,
-        )
+        side = left + right * x + up * height / 2 + out * deep / 2
+        b.box("wood", side, (0.04, height, deep), yaw=yaw, tint=tint, tile=0.8)
+    middle = left + right * width / 2
     levels = np.arange(0.1, height - 0.25, 0.36)
     for level in [*levels, height]:
-        b.box(
-            "wood",
-            middle + up * level + out * deep / 2,
-            (width, 0.035, deep),
-            yaw=yaw,
-            tint=tint,
-            tile=0.8,
-        )
+        board = middle + up * level + out * deep / 2
+        b.box("wood", board, (width, 0.035, deep), yaw=yaw, tint=tint, tile=0.8)
     for level in levels:
-        x = 0.05
-        while x < width - 0.12:
-            if rng.random() < 0.06:
-                thing(b, rng, left + right * (x + 0.1) + up * (level + 0.02) + out * 0.18, 0.24)
-                x += 0.24
-                continue
-            w, h = rng.uniform(0.025, 0.07), rng.uniform(0.19, 0.31)
-            colour = rng.uniform(0.12, 1.1, 3) * rng.uniform(0.5, 1.1)
-            p = (
-                left
-                + right * (x + w / 2)
-                + up * (level + 0.02 + h / 2)
-                + out * rng.uniform(0.16, 0.2)
-            )
-            spine = Cell(int(rng.integers(0, 8)), 0, 8, 1)
-            b.box("spine", p, (w, h, 0.2), yaw=yaw, cell=spine, tint=colour, step=0.2)
-            x += w + 0.004
+        books(b, rng, left, right, width, level)
+
+
+def books(b: Builder, rng: Rng, left: Array, right: Array, width: float, level: float) -> None:
+    """A row of books on the board at the height `level` of a shelf, some things among them."""
+    out, up, yaw = front(right)
+    x = 0.05
+    while x < width - 0.12:
+        if rng.random() < 0.06:
+            thing(b, rng, left + right * (x + 0.1) + up * (level + 0.02) + out * 0.18, 0.24)
+            x += 0.24
+            continue
+        w, h = rng.uniform(0.025, 0.07), rng.uniform(0.19, 0.31)
+        colour = rng.uniform(0.12, 1.1, 3) * rng.uniform(0.5, 1.1)
+        deep = rng.uniform(0.16, 0.2)
+        p = left + right * (x + w / 2) + up * (level + 0.02 + h / 2) + out * deep
+        spine = Cell(int(rng.integers(0, 8)), 0, 8, 1)
+        b.box("spine", p, (w, h, 0.2), yaw=yaw, cell=spine, tint=colour, step=0.2)
+        x += w + 0.004
 
 
 def thing(b: Builder, rng: Rng, foot: Array, size: float) -> None:
@@ -143,7 +131,6 @@ def thing(b: Builder, rng: Rng, foot: Array, size: float) -> None:
 
 def pot_plant(b: Builder, rng: Rng, foot: Array, size: float) -> None:
     """A pot with arching stems."""
-    up = np.array([0, -1, 0], np.float32)
     b.lathe(
         "tile",
         foot,
@@ -155,16 +142,17 @@ def pot_plant(b: Builder, rng: Rng, foot: Array, size: float) -> None:
         angle, lean = rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.55) * size
         s = np.linspace(0, 1, 7)[:, None]
         way = np.array([np.cos(angle), 0, np.sin(angle)], np.float32)
-        stem = foot + up * size * (0.38 + 0.85 * s - 0.25 * s**2) + way * lean * s**2
+        stem = foot + UP * size * (0.38 + 0.85 * s - 0.25 * s**2) + way * lean * s**2
         b.tube("leaf", stem, 0.012 * size + 0.003, sides=4)
         spot = np.repeat(stem[2:], 3, axis=0) + rng.normal(0, 0.06 * size, (15, 3))
         b.leaves(
-            "leaf", spot, spot - foot - up * 0.5 * size, 0.2 * size, rng, tint=(0.8, 1.05, 0.8)
+            "leaf", spot, spot - foot - UP * 0.5 * size, 0.2 * size, rng, tint=(0.8, 1.05, 0.8)
         )
 
 
-def table(b: Builder, rng: Rng, foot: Array, yaw: float, lamps: list[LampPair]) -> None:
-    """Table with a lamp and things on it, a chair on each side."""
+def table(b: Builder, rng: Rng, foot: Array, yaw: float) -> list[Lamp]:
+    """The lamp on a table with things, a chair on each side."""
+    lamps = []
     r, w, d, h = turn(yaw), rng.uniform(1.3, 1.8), 0.8, 0.75
     tint = rng.uniform(0.6, 1.3) * np.ones(3)
     b.box("wood", foot + offset(0, -h, 0), (w, 0.05, d), yaw=yaw, tint=tint, tile=0.7, step=0.12)
@@ -191,7 +179,7 @@ def table(b: Builder, rng: Rng, foot: Array, yaw: float, lamps: list[LampPair]) 
                 tint=(1.0, 0.85, 0.6),
                 glow=0.8,
             )
-            lamps.append((_xyz(spot - offset(0, 0.40, 0)), (1.2, 0.9, 0.55)))
+            lamps.append(lamp(spot - offset(0, 0.40, 0), (1.2, 0.9, 0.55)))
         else:
             thing(b, rng, spot.astype(np.float32), rng.uniform(0.18, 0.3))
     for side in (-1, 1):
@@ -212,6 +200,7 @@ def table(b: Builder, rng: Rng, foot: Array, yaw: float, lamps: list[LampPair]) 
                 tint=tint * 0.9,
                 tile=0.5,
             )
+    return lamps
 
 
 def shell(b: Builder, rng: Rng, half: float, back: float, tall: float) -> None:
@@ -249,27 +238,16 @@ def shell(b: Builder, rng: Rng, half: float, back: float, tall: float) -> None:
         pot_plant(b, rng, at(x0 + wide * (k + 0.5) / 3, low, back - 0.15), rng.uniform(0.35, 0.6))
     colour = rng.uniform(0.3, 1.0, 3)
     for x in (x0 - 0.25, x1 + 0.25):
-        s = np.linspace(-0.3, 0.3, 25)
-        v = [
-            [x + k, at(0, h, 0)[1], back - 0.12 + 0.05 * np.sin(k * 60)]
-            for h in np.linspace(high + 0.2, 0.3, 12)
-            for k in s
-        ]
-        n = [[-np.cos(k * 60) * 0.8, 0, -1.0] for _ in range(12) for k in s]
-        uv = [[k, h] for h in np.linspace(0, 1, 12) for k in s]
-        index = np.arange(12 * 25).reshape(12, 25)
-        quad = np.stack(
-            [
-                index[:-1, :-1],
-                index[1:, 1:],
-                index[:-1, 1:],
-                index[:-1, :-1],
-                index[1:, :-1],
-                index[1:, 1:],
-            ],
-            -1,
-        )
-        b.add("cloth", v, n, uv, quad.reshape(-1, 3), colour)
+        curtain(b, x, back - 0.12, high + 0.2, colour)
+
+
+def curtain(b: Builder, x: float, z: float, top: float, colour: Array) -> None:
+    """A curtain in folds, 0.6 m wide about `x`, from the height `top` to 0.3 m."""
+    across, heights = np.linspace(-0.3, 0.3, 25), np.linspace(top, 0.3, 12)
+    points = [[x + k, at(0, h, 0)[1], z + 0.05 * np.sin(k * 60)] for h in heights for k in across]
+    normals = [[-np.cos(k * 60) * 0.8, 0, -1.0] for _ in heights for k in across]
+    uv = [[k, v] for v in np.linspace(0, 1, 12) for k in across]
+    b.add("cloth", points, normals, uv, grid_faces(12, 25), colour)
 
 
 def garden(b: Builder, rng: Rng, back: float) -> None:
@@ -304,9 +282,9 @@ def posters(b: Builder, rng: Rng, half: float, back: float) -> None:
             )
 
 
-def hanging_lamps(b: Builder, rng: Rng, tall: float) -> list[LampPair]:
-    """Two shades on rods from the ceiling at `tall`, and their lights."""
-    lamps: list[LampPair] = []
+def hanging_lamps(b: Builder, rng: Rng, tall: float) -> list[Lamp]:
+    """The lights of two shades on rods from the ceiling at `tall`."""
+    lamps = []
     for x in rng.uniform(-2.2, 2.2, 2):
         z, drop = rng.uniform(4.5, 6.0), rng.uniform(0.7, 1.0)
         b.tube("metal", [at(x, tall, z), at(x, tall - drop, z)], 0.012)
@@ -320,7 +298,7 @@ def hanging_lamps(b: Builder, rng: Rng, tall: float) -> list[LampPair]:
         b.ball(
             "paint", at(x, tall - drop - 0.24, z), np.full(3, 0.07), glow=1.5, tint=(1, 0.85, 0.6)
         )
-        lamps.append((_xyz(at(x, tall - drop - 0.36, z)), (2.2, 1.7, 1.1)))
+        lamps.append(lamp(at(x, tall - drop - 0.36, z), (2.2, 1.7, 1.1)))
     return lamps
 
 
@@ -339,16 +317,15 @@ def crates(b: Builder, rng: Rng) -> None:
         thing(b, rng, (spot - offset(0, 0.36, 0)).astype(np.float32), 0.26)
 
 
-def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
-    """A study, laid out at random, and its lamps as (position, intensity)."""
+def build(rng: Rng) -> tuple[Builder, list[Lamp]]:
+    """A study, laid out at random, and its lamps."""
     b = Builder(textures(rng), step=0.16)
     half, back, tall = rng.uniform(3.2, 4.0), rng.uniform(7.0, 8.5), rng.uniform(2.9, 3.3)
-    lamps: list[LampPair] = []
     shell(b, rng, half, back, tall)
     garden(b, rng, back)
-    front, left, right = (np.asarray(v, np.float32) for v in ([1, 0, 0], [0, 0, 1], [0, 0, -1]))
-    shelf(b, rng, at(-half + 0.05, 0, back - 0.02), front, half - 1.9, rng.uniform(2.1, 2.6))
-    shelf(b, rng, at(1.9, 0, back - 0.02), front, half - 1.95, rng.uniform(2.1, 2.6))
+    along, left, right = (np.asarray(v, np.float32) for v in ([1, 0, 0], [0, 0, 1], [0, 0, -1]))
+    shelf(b, rng, at(-half + 0.05, 0, back - 0.02), along, half - 1.9, rng.uniform(2.1, 2.6))
+    shelf(b, rng, at(1.9, 0, back - 0.02), along, half - 1.95, rng.uniform(2.1, 2.6))
     shelf(b, rng, at(-half + 0.02, 0, 4.2), left, 2.2, rng.uniform(1.8, 2.6))
     if rng.random() < 0.6:
         shelf(b, rng, at(half - 0.02, 0, 6.2), right, 2.0, rng.uniform(1.3, 2.4))
@@ -362,13 +339,8 @@ def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
         tint=rng.uniform(0.3, 1.0, 3),
         step=0.12,
     )
-    table(
-        b,
-        rng,
-        at(rng.uniform(-0.9, 0.9), 0, rng.uniform(4.6, 5.4)),
-        rng.uniform(-0.35, 0.35),
-        lamps,
-    )
+    spot = at(rng.uniform(-0.9, 0.9), 0, rng.uniform(4.6, 5.4))
+    lamps = table(b, rng, spot, rng.uniform(-0.35, 0.35))
     for side in (-1, 1):
         pot_plant(
             b,
@@ -378,7 +350,6 @@ def build(rng: Rng) -> tuple[Builder, list[LampPair]]:
         )
     lamps += hanging_lamps(b, rng, tall)
     # Lamps behind the camera, out of its sight.
-    for x in (-1.6, 1.6):
-        lamps.append((_xyz(at(x, tall - 0.5, -0.3)), (5.5, 4.8, 3.9)))
+    lamps += [lamp(at(x, tall - 0.5, -0.3), (5.5, 4.8, 3.9)) for x in (-1.6, 1.6)]
     crates(b, rng)
     return b, lamps

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.drops import places_textures as tx
-from pipeline.drops.places_parts import Array, Builder, Cell
+from pipeline.drops.places_parts import Array, Builder, Cell, front
 from pipeline.drops.places_things import (
     at,
     bench,
@@ -58,12 +58,6 @@ def textures(rng: Rng) -> dict[str, Array]:
         "sign": tx.signs(rng),
         "poster": tx.posters(rng),
     }
-
-
-def front(right: Array) -> tuple[Array, Array, float]:
-    """Out of a front along the unit `right`, up, and its angle about the vertical."""
-    out = np.cross(np.array([0, 1, 0], np.float32), right)
-    return out, np.array([0, -1, 0], np.float32), float(np.arctan2(-right[2], right[0]))
 
 
 def window(
