@@ -26,6 +26,8 @@ WOBBLE_ORDERS = (2, 3, 4, 5)
 MAX_TAIL = 3.5  # body radii
 _UNION_POWER = 12.0
 _TIP = 0.6  # width of a tail's end over that of its start
+RUN_SHARE = 0.1  # of the drops that are large enough to run
+TOLERANCE = 0.01  # of the share of a pane that drops shall cover
 
 
 @dataclass(frozen=True)
@@ -230,7 +232,7 @@ def sample_drop(
     *,
     contact_angle_range: tuple[float, float] = (np.radians(30), np.radians(80)),
     merged_share: float = 0.3,
-    run_share: float = 0.1,
+    run_share: float = RUN_SHARE,
     irregularity: float = 1.0,
 ) -> Drop:
     """One random drop of the given place and size.
@@ -261,11 +263,9 @@ def sample_drop(
     )
 
 
-def _window(
-    drop: Drop, shape: tuple[int, int], pitch: float, gap: float = 0.0
-) -> tuple[slice, slice]:
+def _window(drop: Drop, shape: tuple[int, int], pitch: float) -> tuple[slice, slice]:
     """Rows and columns of a raster, pane origin at its centre, that the drop can touch."""
-    extent = reach(drop) + gap + pitch
+    extent = reach(drop) + pitch
     column, row = np.asarray(drop.center) / pitch + np.array([shape[1], shape[0]]) / 2
     half = extent / pitch
     return (
@@ -298,16 +298,6 @@ def coverage_raster(
     return raster
 
 
-def _sample_radius(
-    rng: np.random.Generator, radius_range: tuple[float, float], exponent: float
-) -> float:
-    low, high = radius_range
-    if abs(exponent - 1) < 1e-9:
-        return float(low * (high / low) ** rng.random())
-    power = 1 - exponent
-    return float((low**power + rng.random() * (high**power - low**power)) ** (1 / power))
-
-
 def sample_drops(
     rng: np.random.Generator,
     half_width: float,
@@ -315,32 +305,28 @@ def sample_drops(
     coverage: float,
     radius_range: tuple[float, float],
     *,
-    size_exponent: float = 1.0,
-    tolerance: float = 0.01,
     resolution: int = 512,
-    gap: float = 0.0,
     max_tries: int = 100000,
-    **shape: float | tuple[float, float],
 ) -> list[Drop]:
     """Random drops, none overlapping another, that cover `coverage` of the pane rectangle.
 
     The share is measured on a raster with `resolution` pixels along the longer side and reached
-    within `tolerance`. half_width, half_height, radius_range: metres. Radii follow a density
-    r**-size_exponent (1: log-uniform). gap: metres kept free between drops. `shape` is passed to
-    sample_drop; only drops beyond a fifth of the largest radius leave runs. Raises
-    UserError if the share cannot be reached with drops of these sizes.
+    within TOLERANCE. half_width, half_height, radius_range: metres; the logarithms of the radii are
+    uniform. Only drops beyond a fifth of the largest radius leave runs. Raises UserError if the share
+    cannot be reached with drops of these sizes.
     """
+    low, high = radius_range
     pitch = 2 * max(half_width, half_height) / resolution
-    pad = int(np.ceil(4 * radius_range[1] / pitch)) + 4
+    pad = int(np.ceil(4 * high / pitch)) + 4
     rows, columns = round(2 * half_height / pitch), round(2 * half_width / pitch)
     taken = np.zeros((rows + 2 * pad, columns + 2 * pad), np.bool_)
     inside = (slice(pad, pad + rows), slice(pad, pad + columns))
     drops: list[Drop] = []
     covered = 0.0
     for _ in range(max_tries):
-        if covered >= coverage - 0.5 * tolerance:
+        if covered >= coverage - 0.5 * TOLERANCE:
             return drops
-        radius = _sample_radius(rng, radius_range, size_exponent)
+        radius = float(low * (high / low) ** rng.random())
         center = (
             float(rng.uniform(-half_width - radius, half_width + radius)),
             float(rng.uniform(-half_height - radius, half_height + radius)),
@@ -348,14 +334,14 @@ def sample_drops(
         row, column = (int(center[k] / pitch + taken.shape[1 - k] / 2) for k in (1, 0))
         if taken[row, column]:
             continue
-        details = shape if radius > 0.2 * radius_range[1] else {**shape, "run_share": 0.0}
-        drop = sample_drop(rng, center, radius, **details)  # type: ignore[arg-type]
-        added = _place(taken, inside, drop, pitch, gap, coverage + 0.8 * tolerance - covered)
+        run_share = RUN_SHARE if radius > 0.2 * high else 0.0
+        drop = sample_drop(rng, center, radius, run_share=run_share)
+        added = _place(taken, inside, drop, pitch, coverage + 0.8 * TOLERANCE - covered)
         if added > 0:
             covered += added
             drops.append(drop)
     raise UserError(
-        f"drops of radius {radius_range[0]:.4g}-{radius_range[1]:.4g} m cover only "
+        f"drops of radius {low:.4g}-{high:.4g} m cover only "
         f"{covered:.3f} of the pane, not {coverage:.3f}",
         hint="Lower synthesize.coverage, or the smaller of synthesize.radius_mm.",
     )
@@ -366,16 +352,14 @@ def _place(
     inside: tuple[slice, slice],
     drop: Drop,
     pitch: float,
-    gap: float,
     room: float,
 ) -> float:
-    """Marks the drop on `taken`, if it is free there; returns the share of the inside it covers.
+    """The share of the inside that the drop covers, once it is marked on `taken`.
 
-    Returns 0, and marks nothing, where the drop touches another, adds more than `room`, or lies
-    outside.
+    0, and nothing is marked, where the drop touches another, adds more than `room`, or lies outside.
     """
-    window = _window(drop, taken.shape, pitch, gap)
-    if np.any(taken[window] & _stamp(drop, window, taken.shape, pitch, gap + pitch)):
+    window = _window(drop, taken.shape, pitch)
+    if np.any(taken[window] & _stamp(drop, window, taken.shape, pitch, pitch)):
         return 0.0
     stamp = _stamp(drop, window, taken.shape, pitch)
     pixels = np.count_nonzero(stamp)
