@@ -26,8 +26,8 @@ WORDS = ("EXIT", "Cafe 24", "No Parking", "Hotel", "P 3h", "BOOKS", "open", "Way
 def sample_background(rng: Rng, size: int, *, photo_share: float = 0.2) -> Image:
     """A random (size, size, 3) float32 sRGB picture in [0, 1] without water.
 
-    photo_share: probability of a crop of a photograph, if scikit-image is there. One in four
-    pictures is a blend of two kinds, and all are tinted, turned and blurred at random.
+    photo_share: probability of a crop of a photograph, if scikit-image is there. One in four of the
+    others is a patchwork of two kinds; all are mirrored, blurred and tinted at random.
     """
     photos = _photos()
     if photos and rng.random() < photo_share:
@@ -174,7 +174,7 @@ def _facade(rng: Rng, size: int) -> Image:
 
 
 def _tilt(rng: Rng, picture: NDArray) -> Image:
-    """The picture seen obliquely."""
+    """The picture seen obliquely, or now and then as it is."""
     if rng.random() < 0.3:
         return picture
     size = picture.shape[0]

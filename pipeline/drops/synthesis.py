@@ -45,9 +45,10 @@ class Stains:
 
 @dataclass(frozen=True)
 class WetView:
-    """One view. rainy, clean (H, W, 3) and coverage (H, W) uint8; depth (H, W) metres, 0: sky;
+    """One view through wet glass and what is true of it.
 
-    alpha (H, W) the coverage before it was rounded.
+    rainy, clean (H, W, 3) and coverage (H, W) uint8; depth (H, W) metres, 0: sky; alpha (H, W) the
+    coverage before it was rounded.
     """
 
     rainy: Bytes
@@ -128,9 +129,10 @@ def pane_stains(
     pane_m: float,
     half: Sequence[float] | Matrix,
 ) -> Stains | None:
-    """What else sits on the pane, by kind and share covered; None for nothing. Sizes are those of
+    """What else sits on the pane, by kind and share covered; None for nothing.
 
-    a pane on the lens (0.12 m) and grow with the distance. half: width and height of half the pane.
+    Sizes are those of a pane on the lens (0.12 m) and grow with the distance. half: width and height of
+    half the pane.
     """
     if not any(kinds.values()):
         return None
