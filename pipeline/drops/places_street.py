@@ -94,24 +94,20 @@ def window(
                 step=0.4,
             )
     elif rng.random() < 0.5:
-        n = 60
-        box = middle + np.array([0, h / 2 - 0.06, 0], np.float32) + out * 0.22
-        b.box("wood", box, (w * 0.9, 0.18, 0.2), yaw=yaw, step=0.5)
-        spot = (
-            box
-            + right * rng.uniform(-w * 0.45, w * 0.45, (n, 1))
-            + rng.uniform(-0.12, 0.12, (n, 3))
-        )
-        spot = spot - np.array([0, 0.18, 0])
-        bloom = np.where(rng.random((n, 1)) < 0.4, [[2.2, 0.5, 0.6]], [[1.0, 1.0, 1.0]])
-        b.leaves(
-            "leaf",
-            spot,
-            np.tile(out - [0, 0.6, 0], (n, 1)),
-            0.13,
-            rng,
-            tint=np.repeat(bloom, 4, 0).reshape(n, 4, 3),
-        )
+        flowers(b, rng, middle + np.array([0, h / 2 - 0.06, 0], np.float32), right, w)
+
+
+def flowers(b: Builder, rng: Rng, sill: Array, right: Array, w: float) -> None:
+    """A box of flowers on a sill of width `w` along the unit `right`."""
+    out, _, yaw = front(right)
+    n = 60
+    box = sill + out * 0.22
+    b.box("wood", box, (w * 0.9, 0.18, 0.2), yaw=yaw, step=0.5)
+    along = right * rng.uniform(-w * 0.45, w * 0.45, (n, 1))
+    spot = box + along + rng.uniform(-0.12, 0.12, (n, 3)) - np.array([0, 0.18, 0])
+    bloom = np.where(rng.random((n, 1)) < 0.4, [[2.2, 0.5, 0.6]], [[1.0, 1.0, 1.0]])
+    tint = np.repeat(bloom, 4, 0).reshape(n, 4, 3)
+    b.leaves("leaf", spot, np.tile(out - [0, 0.6, 0], (n, 1)), 0.13, rng, tint=tint)
 
 
 def shop_front(b: Builder, rng: Rng, left: Array, right: Array, width: float, paint: Array) -> None:
