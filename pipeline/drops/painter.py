@@ -24,7 +24,7 @@ from pipeline.drops.optics import (
     srgb_to_linear,
     through_drop,
 )
-from pipeline.drops.shape import Drop, extended_height, reach, sample_drop
+from pipeline.drops.shape import CONTACT_ANGLES, Drop, extended_height, reach, sample_drop
 
 
 def paint(
@@ -223,7 +223,7 @@ def scatter(
     radius_range_px: tuple[float, float],
     *,
     size_exponent: float = 1.5,
-    contact_angle_range: tuple[float, float] = (np.radians(30), np.radians(80)),
+    contact_angle_range: tuple[float, float] = CONTACT_ANGLES,
     margin: float = 0.0,
     max_drops: int = 160,
 ) -> list[Drop]:

@@ -63,8 +63,8 @@ class _Afloat:
 STATIONS = np.linspace(-1, 1, 21)  # along a hull, from stern to bow
 
 
-def hull(b: Builder, boat: _Afloat, free: float, colour: Array) -> tuple[Array, Array]:
-    """Hull with its wale and deck; half widths and heights of the rail along it come out."""
+def hull(b: Builder, boat: _Afloat, free: float, colour: Array) -> Array:
+    """Heights of the rail along a hull, which gets wales, a deck and fenders, at STATIONS."""
     s = STATIONS
     bow = np.sqrt(np.maximum(1 - ((s + 0.2) / 1.2) ** 2, 1e-3))  # a stem, not a point
     beam = np.where(s > -0.2, bow, 1 - 0.2 * (s + 0.2) ** 2)
@@ -92,7 +92,7 @@ def hull(b: Builder, boat: _Afloat, free: float, colour: Array) -> tuple[Array, 
         w = float(np.interp(x, s, beam))
         b.ball("paint", boat.at(x, 0.4 * free, -w * 1.06), (0.10, 0.16, 0.10), sides=8,
                tint=(0.9, 0.35, 0.1))  # fmt: skip
-    return beam, rail
+    return rail
 
 
 def wheelhouse(
@@ -118,7 +118,7 @@ def boat(b: Builder, rng: Rng, middle: Array, yaw: float, long: float, lamps: li
     me = _Afloat(middle, turn(yaw), long, long * float(rng.uniform(0.26, 0.32)))
     free = long * float(rng.uniform(0.13, 0.17))
     colour = np.asarray(HULLS[int(rng.integers(len(HULLS)))])
-    _, rail = hull(b, me, free, colour)
+    rail = hull(b, me, free, colour)
     cabin, lit = float(rng.uniform(-0.45, -0.15)), bool(rng.random() < 0.7)
     wheelhouse(b, rng, me, me.at(cabin, 0.8 * free, 0), yaw, colour, lit)
     foot, tall = me.at(cabin + 0.42, 0.8 * free, 0), long * float(rng.uniform(0.75, 1.0))

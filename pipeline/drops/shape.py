@@ -26,6 +26,7 @@ WOBBLE_ORDERS = (2, 3, 4, 5)
 MAX_TAIL = 3.5  # body radii
 _UNION_POWER = 12.0
 _TIP = 0.6  # width of a tail's end over that of its start
+CONTACT_ANGLES = (np.radians(30), np.radians(80))
 RUN_SHARE = 0.1  # of the drops that are large enough to run
 TOLERANCE = 0.01  # of the share of a pane that drops shall cover
 
@@ -230,7 +231,6 @@ def sample_drop(
     center: tuple[float, float],
     radius: float,
     *,
-    contact_angle_range: tuple[float, float] = (np.radians(30), np.radians(80)),
     merged_share: float = 0.3,
     run_share: float = RUN_SHARE,
     irregularity: float = 1.0,
@@ -253,7 +253,7 @@ def sample_drop(
     return Drop(
         center=(float(center[0]), float(center[1])),
         radius=float(radius),
-        contact_angle=float(rng.uniform(*contact_angle_range)),
+        contact_angle=float(rng.uniform(*CONTACT_ANGLES)),
         wobble=tuple((float(a), float(p)) for a, p in zip(amplitude, phase, strict=True)),
         lobes=tuple(lobes),
         sag=float(rng.uniform(0.0, 0.35)),
