@@ -60,11 +60,11 @@ def test_the_sides_lie_within_the_space_where_they_bulge_beyond_the_corners(
 
 
 def test_sides_that_do_not_bulge_leave_the_bounds_to_the_corners_themselves() -> None:
-    """To the bit: fields fitted through lenses without k1 or with k1 < 0 do not know of the sides."""
+    """To the bit, through lenses without k1, with k1 < 0 or with so little that nothing is cut off."""
     size, near, far = (800, 600), 2.0, 20.0
     poses = np.stack([np.eye(4)] * 3)
     poses[:, 0, 3] = [-0.3, 0.0, 0.2]
-    for k1 in (0.0, -0.08):
+    for k1 in (0.0, -0.08, 0.015):
         intrinsics = np.array([(560.0, 550.0, 390.0, 310.0, k1)] * 3)
         space = scene_space("ndc", poses, intrinsics, np.array([size] * 3), near, far)
         corners = np.empty((3, 4, 3))
