@@ -23,9 +23,8 @@ CONTRACTED_SAMPLES = 32
 CONTRACTED_BINS = 64
 # Most of its table's rows are met by few rays: what these leave there should fade sooner.
 CONTRACTED_DECAY = 3.0
-BULGES = (
-    0.02  # k1 r^2 of a corner; with less, sides reach less than a two hundredth beyond the corners
-)
+# k1 r^2 of a corner; with less, sides reach less than a two hundredth beyond the corners.
+BULGES = 0.02
 FOLDS = 2.0 / 3.0  # where 1 + k1 r^2 is less, the picture of a lens with k1 < 0 folds back
 
 

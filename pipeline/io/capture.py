@@ -186,9 +186,8 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
     when `data` is anything else, or when the capture cannot be used.
     """
     with suppress(RuntimeError):  # no such home: told below as a path that does not exist
-        source = (
-            source.expanduser()
-        )  # make, and some shells behind it, leave FROM=~/photos as it is
+        # make, and some shells behind it, leave FROM=~/photos as it is
+        source = source.expanduser()
     source = Path(os.path.normpath(source))
     if not source.exists():
         raise UserError(f"{source} does not exist.", "Look for a slip of the pen in --from.")
