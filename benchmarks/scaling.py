@@ -26,7 +26,6 @@ import yaml
 from benchmarks.field import FAR, NEAR, photos_and_field
 from pipeline.field import fused
 from pipeline.field.buffer import RayBuffer
-from pipeline.field.encoding import add_rows, gather
 from pipeline.field.fit import fit
 from pipeline.field.grid_field import GridField
 from pipeline.field.render import render_view
@@ -71,10 +70,10 @@ def stages(settings: dict[str, Any]) -> None:
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(3, count, generator=generator)
     grid, hidden = model.grid, model.config.hidden
-    levels_of = list(zip(grid.resolutions, grid.sizes, strict=True))
-    corners = [fused.cell_corners(x, r, s) for r, s in levels_of]
+    names, tables = [str(level) for level in range(levels)], list(grid.tables)
+    totals = [torch.zeros_like(table) for table in tables]
     features = torch.randn(count, levels * model.config.features)
-    gradient = torch.randn(count, model.config.features)
+    gradient = torch.randn(count, levels * model.config.features)
     row_bytes = max(LINE, 4 * model.config.features)
 
     network = [model.shape_in.weight, model.shape_in.bias, model.shape_out.weight,
@@ -106,16 +105,13 @@ def stages(settings: dict[str, Any]) -> None:
         parameter.grad = torch.zeros_like(parameter)
 
     def read() -> None:
-        for (rows, weights), t in zip(corners, grid.tables, strict=True):
-            gather(t.detach(), rows, weights)
+        fused.grid_features(x, names, grid.resolutions, tables, None)
 
     def add() -> None:
-        for (rows, weights), size in zip(corners, grid.sizes, strict=True):
-            add_rows(rows, weights, gradient, size)
-
-    def place() -> None:
-        for r, s in levels_of:
-            fused.cell_corners(x, r, s)
+        first = 0
+        for resolution, total in zip(grid.resolutions, totals, strict=True):
+            fused.CellGradient("", x, resolution, first, gradient).add_to(total)
+            first += total.shape[1]
 
     bins = model.config.bins
     lookups = count * 8 * levels
@@ -124,9 +120,8 @@ def stages(settings: dict[str, Any]) -> None:
         ("proposal, forward", lambda: model._propose(rays, model._noise(rays, generator), []), 0,
          rays_per_step * bins * (LINE + 40)),
         ("samples along rays", sample, 0, count * 6 * 4),
-        ("corners and weights", place, 0, lookups * 8),
-        ("read rows", read, 0, lookups * (row_bytes + 8)),
-        ("add rows", add, 0, lookups * (2 * row_bytes + 8)),
+        ("read rows", read, 0, lookups * row_bytes),
+        ("add rows", add, 0, lookups * 2 * row_bytes),
         ("shape network, both ways", head,
          3 * 2 * count * (hidden * (levels * model.config.features + 16)
                           + levels * model.config.features * 16), 0),

@@ -9,8 +9,6 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from pipeline.field.encoding import RowGradient
-
 
 class Rays(NamedTuple):
     """Rays, components first: ``rays_o``, ``rays_d`` ``(3, R)``, ``near``, ``far`` ``(R,)``.
@@ -37,6 +35,17 @@ class Rendering(NamedTuple):
     opacity: Tensor
     weights: Tensor
     edges: Tensor
+
+
+class TableGradient(Protocol):
+    """A gradient of the parameter named ``table`` that is known by its parts, not yet added up."""
+
+    @property
+    def table(self) -> str:
+        """The parameter's name."""
+
+    def add_to(self, total: Tensor) -> None:
+        """Adds it up in ``total``, of the parameter's shape, in a fixed order on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,7 @@ class Field(Protocol):
         drop_mask: Tensor,
         step: int,
         generator: torch.Generator,
-        sink: list[RowGradient],
+        sink: list[TableGradient],
         gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The loss to descend, and the plain photometric loss (eq. 4) within it.

@@ -1,9 +1,8 @@
 """Where a field keeps what it knows: grids of features, and encodings of position and direction.
 
-The multiresolution hash grid is that of Instant NGP (doi:10.1145/3528223.3530127). On a CPU its
-cost is reading and adding to table rows at random: reading is one ``embedding_bag`` per level,
-adding one product with a sparse matrix, both of which run without a compiler and let other threads
-work meanwhile.
+The multiresolution hash grid is that of Instant NGP (doi:10.1145/3528223.3530127). Its cost is reading
+and adding to table rows at random; on a CPU both run in loops of their own (:mod:`pipeline.field.fused`),
+whose twins in plain tensor operations are here, for every other device.
 """
 
 from __future__ import annotations
@@ -11,13 +10,12 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.sparse import csc_array
 from torch import Tensor, nn
 
 from pipeline.field import fused, kernels
+from pipeline.field.base import TableGradient
 from pipeline.field.sampling import middles
 from pipeline.geometry.constants import constant
 
@@ -34,6 +32,13 @@ class RowGradient(NamedTuple):
     rows: Tensor
     weights: Tensor | None
     gradient: Tensor
+
+    def add_to(self, total: Tensor) -> None:
+        """Adds it up in ``total``, of the table's shape; on a CPU in the order of the samples."""
+        if self.weights is None:
+            add_single(self.rows, self.gradient, total)
+        else:
+            add_rows(self.rows, self.weights, self.gradient, total)
 
 
 def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tuple[Tensor, Tensor]:
@@ -58,22 +63,10 @@ def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tupl
     return rows.view(8, -1).t().contiguous(), weights.view(8, -1).t().contiguous()
 
 
-def add_rows(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
-    """``(size, F)`` with ``weights[n, k] * gradient[n]`` added into row ``rows[n, k]``.
-
-    On a CPU the product of a sparse matrix, one column per sample, with the gradient: one pass in
-    the order of the samples, so the same sums every time.
-    """
-    if rows.device.type != "cpu":
-        expanded = (weights[..., None] * gradient[:, None]).flatten(0, 1)
-        out = torch.zeros(size, gradient.shape[1], device=rows.device, dtype=gradient.dtype)
-        return out.index_add_(0, rows.flatten(), expanded)
-    count, per_sample = rows.shape
-    starts = np.arange(0, count * per_sample + 1, per_sample, dtype=np.int32)
-    matrix = csc_array(
-        (weights.detach().numpy().ravel(), rows.numpy().ravel(), starts), shape=(size, count)
-    )
-    return torch.from_numpy(matrix @ gradient.contiguous().numpy())
+def add_rows(rows: Tensor, weights: Tensor, gradient: Tensor, total: Tensor) -> None:
+    """Adds ``weights[n, k] * gradient[n]`` to row ``rows[n, k]`` of ``total`` ``(size, F)``."""
+    expanded = (weights[..., None] * gradient[:, None]).flatten(0, 1)
+    total.index_add_(0, rows.flatten(), expanded)
 
 
 class _Gather(torch.autograd.Function):
@@ -86,7 +79,7 @@ class _Gather(torch.autograd.Function):
         rows: Tensor,
         weights: Tensor,
         name: str,
-        sink: list[RowGradient] | None,
+        sink: list[TableGradient] | None,
     ) -> Tensor:
         ctx.save_for_backward(rows, weights)
         ctx.name, ctx.sink, ctx.size = name, sink, table.shape[0]
@@ -96,7 +89,9 @@ class _Gather(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Any:
         rows, weights = ctx.saved_tensors
         if ctx.sink is None:
-            return add_rows(rows, weights, gradient, ctx.size), None, None, None, None
+            total = gradient.new_zeros(ctx.size, gradient.shape[1])
+            add_rows(rows, weights, gradient, total)
+            return total, None, None, None, None
         ctx.sink.append(RowGradient(ctx.name, rows, weights, gradient))
         return None, None, None, None, None
 
@@ -106,7 +101,7 @@ def gather(
     rows: Tensor,
     weights: Tensor,
     name: str = "",
-    sink: list[RowGradient] | None = None,
+    sink: list[TableGradient] | None = None,
 ) -> Tensor:
     """``sum_k weights[n, k] * table[rows[n, k]]``, ``(N, F)``, differentiable in ``table``.
 
@@ -121,7 +116,7 @@ class _Pick(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, table: Tensor, rows: Tensor, name: str, sink: list[RowGradient] | None
+        ctx: Any, table: Tensor, rows: Tensor, name: str, sink: list[TableGradient] | None
     ) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.name, ctx.sink, ctx.size = name, sink, table.shape[0]
@@ -132,25 +127,26 @@ class _Pick(torch.autograd.Function):
         (rows,) = ctx.saved_tensors
         flat = gradient.contiguous().view(-1)
         if ctx.sink is None:
-            return add_single(rows.view(-1), flat, ctx.size), None, None, None
+            total = flat.new_zeros(ctx.size, 1)
+            add_single(rows.view(-1), flat, total)
+            return total, None, None, None
         ctx.sink.append(RowGradient(ctx.name, rows.view(-1), None, flat))
         return None, None, None, None
 
 
 def pick(
-    table: Tensor, rows: Tensor, name: str = "", sink: list[RowGradient] | None = None
+    table: Tensor, rows: Tensor, name: str = "", sink: list[TableGradient] | None = None
 ) -> Tensor:
     """``table[rows]`` of a table ``(size, 1)``, in the shape of ``rows``; ``sink`` as for gather."""
     return _Pick.apply(table, rows, name, sink)
 
 
-def add_single(rows: Tensor, gradient: Tensor, size: int) -> Tensor:
-    """``(size, 1)`` with ``gradient`` ``(N,)`` added at ``rows`` ``(N,)``; on a CPU in their order."""
-    out = torch.zeros(size, dtype=gradient.dtype, device=gradient.device)
-    if rows.device.type != "cpu":
-        return out.index_add_(0, rows, gradient)[:, None]
-    kernels.add_single(rows.numpy(), gradient.numpy(), out.numpy())
-    return out[:, None]
+def add_single(rows: Tensor, gradient: Tensor, total: Tensor) -> None:
+    """Adds ``gradient`` ``(N,)`` to ``total`` ``(size, 1)`` at ``rows`` ``(N,)``; on a CPU in their order."""
+    if rows.device.type == "cpu":
+        kernels.add_single(rows.numpy(), gradient.numpy(), total.view(-1).numpy())
+    else:
+        total.view(-1).index_add_(0, rows, gradient)
 
 
 def nearest_rows(
@@ -212,15 +208,17 @@ class HashGrid(nn.Module):
         self,
         x: Tensor,
         prefix: str = "",
-        sink: list[RowGradient] | None = None,
+        sink: list[TableGradient] | None = None,
         fast: bool = False,
     ) -> Tensor:
-        """``sink`` as for :func:`gather`; ``fast``: the corners in one pass, on a CPU."""
+        """``sink`` as for :func:`gather`; ``fast``: in loops of its own, on a CPU."""
+        names = [f"{prefix}tables.{level}" for level in range(len(self.tables))]
+        if fast:
+            return fused.grid_features(x, names, self.resolutions, list(self.tables), sink)
         parts = []
-        corners = fused.cell_corners if fast else cell_corners
-        for level, table in enumerate(self.tables):
-            rows, weights = corners(x, self.resolutions[level], self.sizes[level])
-            parts.append(gather(table, rows, weights, f"{prefix}tables.{level}", sink))
+        for name, table, resolution in zip(names, self.tables, self.resolutions, strict=True):
+            rows, weights = cell_corners(x, resolution, table.shape[0])
+            parts.append(gather(table, rows, weights, name, sink))
         return torch.cat(parts, dim=1)
 
 

@@ -6,14 +6,17 @@ losses.py, encoding.py); the tests hold the two to each other.
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.field import kernels
+from pipeline.field import kernels, table_kernels
+from pipeline.field.base import TableGradient
 from pipeline.geometry.spaces import Space
 
 NOTHING = np.empty((0, 0), np.float32)
@@ -73,13 +76,73 @@ def middles(edges: Tensor) -> tuple[Tensor, Tensor]:
     return x, delta
 
 
-def cell_corners(x: Tensor, resolution: tuple[int, int, int], size: int) -> tuple[Tensor, Tensor]:
-    """As :func:`pipeline.field.encoding.cell_corners`."""
-    rows = torch.empty(x.shape[1], 8, dtype=torch.int32)
-    shares = torch.empty(x.shape[1], 8)
-    sizes, dense = np.array(resolution, np.int32), math.prod(resolution) <= size
-    kernels.corners(x.numpy(), sizes, dense, np.int32(size - 1), rows.numpy(), shares.numpy())
-    return rows, shares
+class CellGradient(NamedTuple):
+    """A gradient of one level's table, not yet added up: columns from ``first`` on of the features'."""
+
+    table: str
+    x: Tensor
+    resolution: tuple[int, int, int]
+    first: int
+    gradient: Tensor
+
+    def add_to(self, total: Tensor) -> None:
+        """Adds what the samples pass back into the table's rows, ``(size, F)``, sample by sample."""
+        table_kernels.add_rows(
+            self.x.numpy(), *_grid(self.resolution, total.shape[0]), self.gradient.numpy(),
+            self.first, total.numpy(), (0,) * total.shape[1],
+        )  # fmt: skip
+
+
+def _grid(resolution: tuple[int, int, int], size: int) -> tuple[np.ndarray, bool, np.int32]:
+    """Vertices per axis, whether a table of ``size`` rows holds them all, and its last row."""
+    return np.array(resolution, np.int32), math.prod(resolution) <= size, np.int32(size - 1)
+
+
+class _GridFeatures(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        names: Sequence[str],
+        resolutions: Sequence[tuple[int, int, int]],
+        sink: list[TableGradient] | None,
+        *tables: Tensor,
+    ) -> Tensor:
+        firsts = list(itertools.accumulate((table.shape[1] for table in tables), initial=0))
+        out = torch.empty(x.shape[1], firsts[-1])
+        for table, resolution, first in zip(tables, resolutions, firsts, strict=False):
+            table_kernels.read_rows(
+                x.numpy(), *_grid(resolution, table.shape[0]), table.detach().numpy(), first,
+                out.numpy(), (0,) * table.shape[1],
+            )  # fmt: skip
+        ctx.save_for_backward(x)
+        ctx.sink, ctx.levels = sink, list(zip(names, resolutions, firsts, strict=False))
+        ctx.shapes = [table.shape for table in tables]
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> Any:
+        (x,), g = ctx.saved_tensors, g.contiguous()
+        entries = [CellGradient(n, x, r, first, g) for n, r, first in ctx.levels]
+        if ctx.sink is not None:
+            ctx.sink.extend(entries)
+            return (None,) * (4 + len(entries))
+        totals = [torch.zeros(shape) for shape in ctx.shapes]
+        for entry, total in zip(entries, totals, strict=True):
+            entry.add_to(total)
+        return None, None, None, None, *totals
+
+
+def grid_features(
+    x: Tensor,
+    names: Sequence[str],
+    resolutions: Sequence[tuple[int, int, int]],
+    tables: Sequence[Tensor],
+    sink: list[TableGradient] | None,
+) -> Tensor:
+    """As :meth:`pipeline.field.encoding.HashGrid.forward`; ``names`` are the tables' in the sink."""
+    out: Tensor = _GridFeatures.apply(x, names, resolutions, sink, *tables)
+    return out
 
 
 def _absorbed(raw: Tensor, delta: Tensor, limit: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -188,7 +251,7 @@ class _Network(torch.autograd.Function):
         g_hidden = torch.ops.aten.threshold_backward(low @ w_out, hidden, 0)
         g_x = (g_hidden @ w_in).addmm_(low, w_skip)
         g_in, g_out, g_skip = g_hidden.t() @ x, low.t() @ hidden, low.t() @ x
-        sums = g_hidden.sum(0, dtype=torch.float32), g.sum(0)
+        sums = (low.new_ones(1, low.shape[0]) @ g_hidden)[0].float(), g.sum(0)
         return g_x.float(), None, g_in.float(), sums[0], g_out.float(), sums[1], g_skip.float()
 
 

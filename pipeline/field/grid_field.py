@@ -9,10 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.field import fused
-from pipeline.field.base import Part, Rays, Rendering
+from pipeline.field.base import Part, Rays, Rendering, TableGradient
 from pipeline.field.encoding import (
     HashGrid,
-    RowGradient,
     level_resolutions,
     nearest_rows,
     pick,
@@ -72,6 +71,17 @@ class Noise(NamedTuple):
     along_weight: Tensor
 
 
+class Shaded(NamedTuple):
+    """``rgb`` ``(R, 3)``, ``weights`` ``(R, S)`` of the intervals between ``edges`` ``(R, S+1)`` and their
+    lengths ``delta`` ``(R, S)`` in the unit cube; ``shape`` ``(R, S, 16)``: log density first."""
+
+    rgb: Tensor
+    weights: Tensor
+    edges: Tensor
+    shape: Tensor
+    delta: Tensor
+
+
 class GridField(nn.Module):
     """Position to density and features through the grid; features along the ray to colour.
 
@@ -100,7 +110,12 @@ class GridField(nn.Module):
     def render(self, rays: Rays) -> Rendering:
         """See :class:`pipeline.field.base.Field`."""
         with torch.no_grad():
-            return self._shade(rays, self._propose(rays, None, None), None, None)
+            out = self._shade(rays, self._propose(rays, None, None), None, None)
+            middle = 0.5 * (out.edges[:, 1:] + out.edges[:, :-1])
+            depth = depth_at((out.weights * middle).sum(-1), rays.near, rays.far)
+            sigma = torch.exp(out.shape[..., 0].clamp_max(MAX_LOG_DENSITY))
+            opacity = 1.0 - torch.exp(-(sigma * out.delta).sum(-1))
+            return Rendering(out.rgb, depth, opacity, out.weights, out.edges)
 
     def loss(
         self,
@@ -109,7 +124,7 @@ class GridField(nn.Module):
         drop_mask: Tensor,
         step: int,
         generator: torch.Generator,
-        sink: list[RowGradient],
+        sink: list[TableGradient],
         gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """See :class:`pipeline.field.base.Field`."""
@@ -159,7 +174,7 @@ class GridField(nn.Module):
             Part("head", head, 1e-2, 0.03, betas, 1e-8, 50),
         ]
 
-    def _propose(self, rays: Rays, noise: Noise | None, sink: list[RowGradient] | None) -> Tensor:
+    def _propose(self, rays: Rays, noise: Noise | None, sink: list[TableGradient] | None) -> Tensor:
         """The proposal's weights ``(R, B)`` in equal bins of normalised depth."""
         bins, sizes = self.config.bins, self.config.proposal
         edges = self._walk(rays, torch.linspace(0, 1, bins + 1, device=rays.near.device)[None])
@@ -179,9 +194,9 @@ class GridField(nn.Module):
         rays: Rays,
         proposed: Tensor,
         noise: Noise | None,
-        sink: list[RowGradient] | None,
-    ) -> Rendering:
-        """Colours and depths from samples where the proposal has its weight."""
+        sink: list[TableGradient] | None,
+    ) -> Shaded:
+        """Colours from samples where the proposal has its weight."""
         count, samples = rays.near.shape[0], self.config.samples
         u = stratified(count, samples, None, rays.near) if noise is None else noise.along_weight
         mixed = proposed + 0.01 / self.config.bins
@@ -202,12 +217,7 @@ class GridField(nn.Module):
         hidden = torch.cat([seen, spherical_harmonics(rays.rays_d)], dim=1)
         hidden = torch.relu(self.colour_mid(torch.relu(self.colour_in(hidden))))
         rgb = torch.sigmoid(self.colour_out(hidden) + seen[:, :3])
-        with torch.no_grad():
-            middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-            depth = depth_at((weights * middle).sum(-1), rays.near, rays.far)
-            sigma = torch.exp(shape[..., 0].clamp_max(MAX_LOG_DENSITY))
-            opacity = 1.0 - torch.exp(-(sigma * delta).sum(-1))
-        return Rendering(rgb, depth, opacity, weights, edges)
+        return Shaded(rgb, weights, edges, shape, delta)
 
     def _shape(self, features: Tensor) -> Tensor:
         """Log density and what the colour is made of, ``(N, 16)``.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from pipeline.field.base import Part, Rays, Rendering
-from pipeline.field.encoding import RowGradient, positional_encoding
+from pipeline.field.base import Part, Rays, Rendering, TableGradient
+from pipeline.field.encoding import positional_encoding
 from pipeline.field.losses import masked_photometric_loss
 from pipeline.field.sampling import depth_at, invert_pieces, stratified
 from pipeline.field.volume import composite, render_weights
@@ -91,7 +91,7 @@ class PaperField(nn.Module):
         drop_mask: Tensor,
         step: int,
         generator: torch.Generator,
-        sink: list[RowGradient],
+        sink: list[TableGradient],
         gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The sum of both networks' photometric losses; the fine one's alone beside it."""

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pipeline.field.base import Field, Part
+from pipeline.field.base import Field, Part, TableGradient
 from pipeline.field.buffer import Batch
-from pipeline.field.encoding import RowGradient, add_rows, add_single
 
 
 class Exposure(nn.Module):
@@ -40,6 +39,7 @@ class Stepper:
     ) -> None:
         self.part, self.parameters, self.steps = part, parameters, steps
         self.rate = part.rate * rate
+        self.rooms: dict[str, Tensor] = {}
         self.adam = torch.optim.AdamW(
             parameters,
             lr=self.rate,
@@ -68,6 +68,13 @@ class Stepper:
         self.adam.step()
         for parameter in self.parameters:
             parameter.grad = None
+
+    def room(self, name: str) -> Tensor:
+        """Zeros of a parameter's shape to add its gradient up in, the same memory in every step."""
+        if name not in self.rooms:
+            place = self.part.parameters.index(name)
+            self.rooms[name] = torch.zeros_like(self.parameters[place])
+        return self.rooms[name].zero_()
 
     def state(self) -> dict[str, Tensor]:
         """Adam's running moments by name; what :meth:`restore` takes back."""
@@ -132,7 +139,7 @@ class Found(NamedTuple):
 
     losses: Tensor
     gradients: dict[str, Tensor | None]
-    sink: list[RowGradient]
+    sink: list[TableGradient]
 
 
 def found_in(
@@ -150,7 +157,7 @@ def found_in(
         for stepper in steppers
         for name, parameter in zip(stepper.part.parameters, stepper.parameters, strict=True)
     }
-    sink: list[RowGradient] = []
+    sink: list[TableGradient] = []
     gain = None if light is None else light.gains().index_select(0, piece.view)
     loss, photometric = as_field(model).loss(
         piece.rays, piece.observed, piece.drop_mask, step, source, sink, gain
@@ -160,31 +167,26 @@ def found_in(
     return Found(both, dict(zip(named, gradients, strict=True)), sink)
 
 
-def total(name: str, parameter: nn.Parameter, found: Sequence[Found]) -> Tensor | None:
-    """One parameter's gradient over all pieces, added in a fixed order."""
-    rows = [entry for piece in found for entry in piece.sink if entry.table == name]
-    if rows:
-        places = _joined([entry.rows for entry in rows])
-        gradient = _joined([entry.gradient for entry in rows])
-        weights = [entry.weights for entry in rows if entry.weights is not None]
-        if not weights:
-            return add_single(places, gradient, parameter.shape[0])
-        return add_rows(places, _joined(weights), gradient, parameter.shape[0])
-    parts = [piece.gradients[name] for piece in found]
+def totals(stepper: Stepper, found: Sequence[Found]) -> list[Tensor | None]:
+    """The gradients of all of a part's parameters over all pieces, added in a fixed order."""
+    out: list[Tensor | None] = []
+    for name in stepper.part.parameters:
+        entries = [entry for piece in found for entry in piece.sink if entry.table == name]
+        if entries:
+            total = stepper.room(name)
+            for entry in entries:
+                entry.add_to(total)
+            out.append(total)
+        else:
+            out.append(_sum([piece.gradients[name] for piece in found]))
+    return out
+
+
+def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
     dense = [part for part in parts if part is not None]
     if len(dense) == 1:
         return dense[0]
     return torch.stack(dense).sum(0) if dense else None
-
-
-def totals(stepper: Stepper, found: Sequence[Found]) -> list[Tensor | None]:
-    """The gradients of all of a part's parameters."""
-    pairs = zip(stepper.part.parameters, stepper.parameters, strict=True)
-    return [total(name, parameter, found) for name, parameter in pairs]
-
-
-def _joined(parts: list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def as_field(model: nn.Module) -> Field:

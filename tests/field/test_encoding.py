@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.field.base import TableGradient
 from pipeline.field.encoding import (
     HashGrid,
-    RowGradient,
     add_rows,
     cell_corners,
     gather,
@@ -44,7 +44,8 @@ def test_adding_rows_is_the_transpose_of_gathering() -> None:
     table, upstream = torch.rand(16, 3, generator=g), torch.rand(40, 3, generator=g)
     rows = torch.randint(0, 16, (40, 8), generator=g, dtype=torch.int32)
     weights = torch.rand(40, 8, generator=g)
-    added = add_rows(rows, weights, upstream, 16)
+    added = torch.zeros(16, 3)
+    add_rows(rows, weights, upstream, added)
     forward = (gather(table, rows, weights) * upstream).sum()
     assert float((table * added).sum()) == pytest.approx(float(forward), rel=1e-5)
 
@@ -55,13 +56,15 @@ def test_the_sink_holds_what_the_dense_gradient_adds_up() -> None:
     weights, upstream = torch.rand(40, 8, generator=g), torch.rand(40, 2, generator=g)
     table = torch.rand(16, 2, generator=g, requires_grad=True)
     gather(table, rows, weights).backward(upstream)
-    sink: list[RowGradient] = []
+    sink: list[TableGradient] = []
     again = table.detach().clone().requires_grad_()
     gather(again, rows, weights, "t", sink).backward(upstream)
     assert again.grad is None
     (entry,) = sink
     assert entry.table == "t"
-    assert torch.equal(add_rows(entry.rows, entry.weights, entry.gradient, 16), table.grad)
+    total = torch.zeros(16, 2)
+    entry.add_to(total)
+    assert torch.equal(total, table.grad)
 
 
 def test_a_grid_is_the_same_for_the_same_generator() -> None:

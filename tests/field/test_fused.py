@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from pipeline.field import encoding, fused, losses, sampling
-from pipeline.field.base import Rays
-from pipeline.field.encoding import RowGradient, add_rows, add_single
+from pipeline.field.base import Rays, TableGradient
+from pipeline.field.encoding import HashGrid
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.volume import composite, render_weights
 from pipeline.geometry.spaces import Space
@@ -59,19 +59,53 @@ def test_positions_along_rays(space: Space, rows: int) -> None:
     assert float(found.std()) > 0.05
 
 
-@pytest.mark.parametrize("size", [4096, 64])
-def test_corners_are_those_of_the_grid(size: int) -> None:
+RESOLUTIONS = [(5, 4, 3), (17, 9, 12)]  # into 64 rows: the one indexed, the other hashed
+
+
+def a_grid(features: int) -> HashGrid:
+    grid = HashGrid(RESOLUTIONS, features, 6, source(1))
+    with torch.no_grad():
+        for table in grid.tables:
+            table.uniform_(-1, 1, generator=source(2))
+    return grid
+
+
+@pytest.mark.parametrize("features", [1, 2, 3, 8])
+@pytest.mark.parametrize("deferred", [False, True])
+def test_features_of_a_grid_and_what_they_pass_back(features: int, deferred: bool) -> None:
     x = torch.rand(3, 500, generator=source())
     x[:, :3] = torch.tensor([0.0, 1.0, 0.5])
-    rows, shares = fused.cell_corners(x, (17, 9, 12), size)
-    expected, weights = encoding.cell_corners(x, (17, 9, 12), size)
-    assert torch.equal(rows, expected)
-    torch.testing.assert_close(shares, weights, atol=1e-5, rtol=0)
+    upstream = torch.rand(500, 2 * features, generator=source(3))
+    grid, results = a_grid(features), []
+    for fast in (False, True):
+        sink: list[TableGradient] | None = [] if deferred else None
+        out = grid(x, "", sink, fast=fast)
+        found = torch.autograd.grad(out, list(grid.tables), upstream, allow_unused=deferred)
+        gradients = [
+            torch.zeros_like(table) if g is None else g
+            for table, g in zip(grid.tables, found, strict=True)
+        ]
+        for entry in sink or []:
+            entry.add_to(gradients[int(entry.table.split(".")[-1])])
+        results.append([out.detach(), *gradients])
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+        assert float(one.abs().max()) > 0.1
 
 
-def test_rows_stay_in_the_table_when_a_broken_fit_asks_for_nan() -> None:
-    rows, _ = fused.cell_corners(torch.full((3, 4), float("nan")), (17, 9, 12), 64)
-    assert int(rows.min()) >= 0 and int(rows.max()) < 64
+@pytest.mark.parametrize("points", [1, 7, 8, 9])
+def test_few_points_are_read_as_many_are(points: int) -> None:
+    x, grid = torch.rand(3, 40, generator=source()), a_grid(8)
+    expected = grid(x, fast=True)[:points]
+    assert torch.equal(grid(x[:, :points].contiguous(), fast=True), expected)
+
+
+def test_a_broken_fit_that_asks_for_nan_reads_and_adds_within_the_table() -> None:
+    x, grid = torch.full((3, 4), float("nan")), a_grid(2)
+    out = grid(x, fast=True)
+    assert bool(out.isnan().all())
+    for gradient in torch.autograd.grad(out.sum(), list(grid.tables)):
+        assert int(gradient.isnan().any(1).sum()) <= 8
 
 
 @pytest.mark.parametrize("random", [True, False])
@@ -166,18 +200,14 @@ def test_a_whole_step(space: Space) -> None:
     for plain in (True, False):
         field = GridField(replace(SMALL, distortion=0.1), space, 0)
         field.plain = plain
-        sink: list[RowGradient] = []
+        sink: list[TableGradient] = []
         loss, _ = field.loss(rays, observed, none, 0, source(4), sink)
         named = dict(field.named_parameters())
         found = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
         gradients = {n: g for n, g in zip(named, found, strict=True) if g is not None}
         for entry in sink:
-            size = named[entry.table].shape[0]
-            gradients[entry.table] = (
-                add_single(entry.rows, entry.gradient, size)
-                if entry.weights is None
-                else add_rows(entry.rows, entry.weights, entry.gradient, size)
-            )
+            total = gradients.setdefault(entry.table, torch.zeros_like(named[entry.table]))
+            entry.add_to(total)
         results.append((loss.detach(), gradients, field.render(rays)))
     (loss, gradients, view), (same_loss, same_gradients, same_view) = results
     torch.testing.assert_close(loss, same_loss)
