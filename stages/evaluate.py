@@ -52,7 +52,7 @@ def main(job: Job, params: Params) -> str:
         {name: view.cam_from_world for name, view in views.items()},
         read_true_cameras(truth, records),
         len(records),
-        f"{_shown(job, truth)} does not exist",
+        _without(job, "true cameras", truth),
     )
     metrics["rounds"] = score_rounds(paths.refine, files, params.coverage_threshold)
     metrics["conventions"] = conventions(params.coverage_threshold)
@@ -88,9 +88,9 @@ def _files(job: Job, records: Sequence[ImageRecord]) -> dict[str, Files]:
 
 def _reasons(job: Job, files: Mapping[str, Files], backbone: Path | None) -> dict[str, str]:
     reasons = {}
-    for kind in ("clean", "coverage"):
+    for kind, what in (("clean", "clean references"), ("coverage", "true masks")):
         if not any(getattr(entry, kind) for entry in files.values()):
-            reasons[kind] = f"{_shown(job, job.paths.truth / kind)} does not exist"
+            reasons[kind] = _without(job, what, job.paths.truth / kind)
     if backbone is None:
         reasons["lpips"] = "evaluate.lpips_backbone names no AlexNet weights"
     if not flip.AVAILABLE:
@@ -106,8 +106,8 @@ def _reasons(job: Job, files: Mapping[str, Files], backbone: Path | None) -> dic
     return reasons
 
 
-def _shown(job: Job, path: Path) -> str:
-    return path.relative_to(job.root).as_posix()
+def _without(job: Job, what: str, path: Path) -> str:
+    return f"there are no {what}: {path.relative_to(job.root).as_posix()} does not exist"
 
 
 if __name__ == "__main__":
