@@ -109,7 +109,9 @@ def main(job: Job, params: Params) -> str:
     write_json(work / MARKER, recipe)
     with publish_dir(final) as fresh:
         shutil.copytree(work, fresh, dirs_exist_ok=True)
-    shutil.rmtree(work)
+    # Also what was interrupted with other settings or code.
+    for begun in sorted(work.parent.glob("*/")):
+        shutil.rmtree(begun)
     return f"{len(list(final.glob('*.jpg')))} wet views with their truth in {final}"
 
 

@@ -232,8 +232,9 @@ def test_paint_wets_all_photos_with_the_same_drops(tmp_path: Path) -> None:
     assert (data / "0.jpg").read_bytes() == first
 
 
+@pytest.mark.parametrize("change", [{}, {"seed": 1 + RECIPE["seed"]}])
 def test_what_an_interrupted_run_painted_of_a_photo_now_gone_does_not_come_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, int]
 ) -> None:
     photos(tmp_path)
 
@@ -242,11 +243,14 @@ def test_what_an_interrupted_run_painted_of_a_photo_now_gone_does_not_come_back(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(synthesize, "publish_dir", interrupted)
-        synthesize.main(job(tmp_path), synthesize.Params(**RECIPE))
+        synthesize.main(job(tmp_path), synthesize.Params(**RECIPE | change))
+    work = job(tmp_path).paths.work("synthesize")
+    assert any(work.glob("*/"))
     (tmp_path / "clean/1.png").unlink()
     synthesize.main(job(tmp_path), synthesize.Params(**RECIPE))
     made = {path.stem for path in (tmp_path / "data/wet").rglob("*.*") if path.stem in "01"}
     assert made == {"0"}
+    assert not any(work.glob("*/"))
 
 
 def test_folders_of_others_are_refused_and_left_alone(tmp_path: Path) -> None:
