@@ -108,15 +108,15 @@ class _GridFeatures(torch.autograd.Function):
         sink: list[TableGradient] | None,
         *tables: Tensor,
     ) -> Tensor:
-        firsts = list(itertools.accumulate((table.shape[1] for table in tables), initial=0))
-        out = torch.empty(x.shape[1], firsts[-1])
-        for table, resolution, first in zip(tables, resolutions, firsts, strict=False):
+        *firsts, width = itertools.accumulate((table.shape[1] for table in tables), initial=0)
+        out = torch.empty(x.shape[1], width)
+        for table, resolution, first in zip(tables, resolutions, firsts, strict=True):
             table_kernels.read_rows(
                 x.numpy(), *_grid(resolution, table.shape[0]), table.detach().numpy(), first,
                 out.numpy(), (0,) * table.shape[1],
             )  # fmt: skip
         ctx.save_for_backward(x)
-        ctx.sink, ctx.levels = sink, list(zip(names, resolutions, firsts, strict=False))
+        ctx.sink, ctx.levels = sink, list(zip(names, resolutions, firsts, strict=True))
         ctx.shapes = [table.shape for table in tables]
         return out
 
