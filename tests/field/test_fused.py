@@ -105,7 +105,7 @@ def test_a_broken_fit_that_asks_for_nan_reads_and_adds_within_the_table() -> Non
     out = grid(x, fast=True)
     assert bool(out.isnan().all())
     for gradient in torch.autograd.grad(out.sum(), list(grid.tables)):
-        assert int(gradient.isnan().any(1).sum()) <= 8
+        assert 1 <= int(gradient.isnan().any(1).sum()) <= 8  # none: they went elsewhere
 
 
 @pytest.mark.parametrize("random", [True, False])
