@@ -20,6 +20,8 @@ PHOTO_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif"}
 )
 MAX_PIXELS = 200_000_000
+# Pillow's own limit is 179 million, fewer than some phones' photos have; MAX_PIXELS is told in words.
+Image.MAX_IMAGE_PIXELS = None
 # EXIF orientation -> degrees counter-clockwise that make the stored pixels upright. The mirrored codes
 # (2, 4, 5, 7) come from editing programs, not cameras; they are undone before the turn.
 _TURN = {1: 0, 2: 0, 3: 180, 4: 180, 5: 270, 6: 270, 7: 90, 8: 90}
@@ -88,7 +90,7 @@ def image_size(path: Path) -> tuple[int, int]:
             warnings.simplefilter("ignore")
             with Image.open(path) as photo:
                 return photo.size
-    except (SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (SyntaxError, ValueError) as error:
         raise OSError(str(error)) from error
 
 
@@ -132,7 +134,7 @@ def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
         raise UserError(
             f"{path} cannot be read ({error.strerror}).", "Check its permissions."
         ) from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError) as error:
         raise UserError(
             f"{path} is damaged or cut short ({error}).", "Copy it again, or remove it."
         ) from None

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -165,6 +167,28 @@ def test_a_photo_that_may_not_be_read_is_not_called_damaged(
     monkeypatch.setattr(Image, "open", forbidden)
     with pytest.raises(UserError, match=r"a\.jpg cannot be read \(Permission denied\)"):
         read_photo(tmp_path / "a.jpg")
+
+
+def test_photos_of_200_megapixels_are_read_and_larger_ones_told_so(tmp_path: Path) -> None:
+    """Phones take 16320x12240; Pillow alone refuses more than 179 million pixels as an attack."""
+    photo = tmp_path / "a.png"
+    photo.write_bytes(_png_header(16320, 12240))
+    assert image_size(photo) == (16320, 12240)
+    with pytest.raises(
+        UserError, match=r"a\.png is damaged or cut short \(image file is truncated"
+    ):
+        read_photo(photo)  # only because there is nothing behind the header
+    photo.write_bytes(_png_header(100_000, 100_000))
+    with pytest.raises(UserError, match="has 100000x100000 pixels"):
+        read_photo(photo)
+
+
+def _png_header(width: int, height: int) -> bytes:
+    """The beginning of a grey PNG without any pixels."""
+    size = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunks = ((size, 13), (b"IDAT", 0), (b"IEND", 0))
+    told = (struct.pack(">I", n) + data + struct.pack(">I", zlib.crc32(data)) for data, n in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(told)
 
 
 def test_what_is_no_photo_is_named(tmp_path: Path) -> None:
