@@ -49,7 +49,8 @@ def given_turns(
     """Degrees ccw by which each photo's stored pixels become those of its camera; None without views.
 
     Programs disagree on whether a photo's metadata turns it; the cameras' sizes tell. A photo without a
-    pose is turned as its neighbours are. UserError when a camera has the size of neither.
+    pose is turned as its neighbours are, or made upright where it has another shape than they. UserError
+    when a camera has the size of neither.
     """
     if not views:
         return None
@@ -58,6 +59,8 @@ def given_turns(
     for name, photo in photos.items():
         view = views.get(name, some)
         degrees = view.turn_for((photo.width, photo.height), photo.upright_turn)
+        if degrees is None and name not in views:
+            degrees = photo.upright_turn
         if degrees is None:
             raise UserError(
                 f"{view.photo} has {photo.width}x{photo.height} pixels, its camera "

@@ -15,9 +15,12 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import UserError
+from pipeline.io.given import GivenView
 from pipeline.io.given_masks import pass_on_masks
 from pipeline.io.images import image_size, read_image
+from pipeline.io.intake import given_turns
 from pipeline.io.masks import read_keep_mask
+from pipeline.io.photos import Photo, plan_sizes
 from pipeline.io.scene import read_images_json, read_origin
 from pipeline.io.transforms import read_transforms
 from pipeline.io.video import write_video
@@ -109,6 +112,22 @@ def test_given_poses_decide_whether_the_metadata_turns_a_photo(
     record = read_images_json(images)[0]
     assert record.turned == (0 if upright else 90)
     assert record.source == "images/a.jpg"
+
+
+def test_a_photo_without_a_pose_may_have_another_shape() -> None:
+    """A COLMAP model places the landscapes alone: the portrait beside them is left out, not refused."""
+    names = ("a.png", "b.png", "c.png", "d.png")
+    photos = {name: Photo(40, 30, 0, None, name) for name in names[:3]}
+    photos["d.png"] = Photo(30, 40, 0, None, "d.png")
+    where = dict(cam_from_world=np.eye(4), width=40, height=30, fx=30.0, fy=30.0, cx=20.0, cy=15.0)
+    views = {name: GivenView(Path(name).with_suffix(".jpg"), **where) for name in names[:2]}
+    turns = given_turns(photos, views)
+    assert turns == dict.fromkeys(names, 0)
+    plan = plan_sizes(photos, fixed_turns=turns)
+    assert plan.size == (40, 30) and plan.left_out == ["d.png"]
+    photos["b.png"] = photos["d.png"]
+    with pytest.raises(UserError, match=r"b\.jpg has 30x40 pixels, its camera 40x30"):
+        given_turns(photos, views)
 
 
 def test_rain_masks_are_scaled_and_passed_on_with_the_right_polarity(tmp_path: Path) -> None:
