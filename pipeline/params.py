@@ -15,6 +15,7 @@ from pipeline.errors import UserError
 STAGES = Path(__file__).resolve().parents[1] / "stages"
 CORRECT = "Correct it and run again."
 OTHER_SECTIONS = ("scene_defaults", "scenes", "variants", "comparisons", "comparison")
+NAMED = ("scenes", "variants")
 BASE = "base"  # another file of parameters, which this one changes
 FOLDERS = "folders"  # of a variant: where it finds its photos, masks, ...
 
@@ -67,7 +68,7 @@ def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     if BASE in content:
         below = read_params(file.parent / str(content[BASE]), (*above, file.resolve()))
         content = _upon(file, below, content)
-    for kind in ("scenes", "variants"):
+    for kind in NAMED:
         if not content.get(kind):
             continue
         choices = _mapping(file, kind, content[kind])
@@ -140,7 +141,7 @@ def with_scene(file: Path, scene: str) -> str | None:
     if scene in (content.get("scenes") or {}):
         return None
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    entry = f"  {scene}: {{<<: *scene}}\n"
+    entry = f"  {_as_key(scene)}: {{<<: *scene}}\n"
     start = next((i for i, line in enumerate(lines) if line.split("#")[0].strip() == "scenes:"), -1)
     if start >= 0:
         end = start + 1
@@ -152,16 +153,34 @@ def with_scene(file: Path, scene: str) -> str | None:
         before = "".join(lines[:end])
         text = before + ("" if before.endswith("\n") else "\n") + entry + "".join(lines[end:])
         try:
-            edited = YAML(typ="safe").load(text)
+            edited = _by_names(YAML(typ="safe").load(text))
             anchored = edited["scenes"].pop(scene)
-        except (YAMLError, TypeError, KeyError):
-            edited = anchored = None
+        except (YAMLError, ValueError, AttributeError, TypeError, KeyError):
+            edited, anchored = {}, None
         if edited == {**content, "scenes": content.get("scenes") or {}} and anchored is not None:
             return text
     raise UserError(
         f"{file}: the scene {scene} could not be added.",
         f"Write it under scenes: by hand, as `{entry.strip()}`.",
     )
+
+
+def _as_key(name: str) -> str:
+    """`name` as a key of YAML: quoted where it would be a number, a date (2024-05-01) or nothing."""
+    try:
+        plain = YAML(typ="safe").load(name) == name
+    except ValueError:  # the thirteenth month
+        plain = False
+    return name if plain else f'"{name}"'
+
+
+def _by_names(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a file with the names of its scenes and variants as text, as `read_params` has them."""
+    named = {kind: content[kind] for kind in NAMED if content.get(kind)}
+    return {
+        **content,
+        **{kind: {str(name): v for name, v in choices.items()} for kind, choices in named.items()},
+    }
 
 
 def stage_names() -> list[str]:

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import pytest
 from pydantic import Field
+from ruamel.yaml import YAML
 
 from pipeline.errors import UserError
 from pipeline.io.paths import ScenePaths
@@ -169,6 +170,17 @@ def test_a_scene_is_added_and_nothing_else_changes(tmp_path: Path) -> None:
     assert with_scene(file, "demo") is None
     file.write_text("scene_defaults: &scene {masks: {}}\nscenes:\n  demo: {}")
     assert with_scene(file, "b") == file.read_text() + "\n  b: {<<: *scene}\n"
+
+
+@pytest.mark.parametrize("name", ["2024", "2024-05-01", "2024-13-01", "007", "1e3", "null"])
+def test_a_scene_may_have_a_number_or_a_date_for_a_name(tmp_path: Path, name: str) -> None:
+    """YAML would make 7 of 007; DVC and `--scene 007` look for text."""
+    file = _file(tmp_path, "scene_defaults: &scene {masks: {}}\nscenes:\n  demo: {<<: *scene}\n")
+    file.write_text(with_scene(file, name) or "")
+    assert list(YAML(typ="safe").load(file.read_text())["scenes"]) == ["demo", name]
+    assert with_scene(file, name) is None
+    file.write_text(file.read_text() + "  2025: {<<: *scene}\n")  # as written by hand
+    assert (with_scene(file, "garden") or "").endswith("\n  garden: {<<: *scene}\n")
 
 
 @pytest.mark.parametrize(
