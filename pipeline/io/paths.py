@@ -9,15 +9,14 @@ from pathlib import Path
 
 from pipeline.errors import UserError
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+# No dots: DVC follows the parameters `scenes.NAME.ingest`, and would look for the parts of the name.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 SHARED = ("images", "attention", "masks", "poses", "refine")
 # What lies in a scene's folder, where its variants have their own: none of them may bear such a name.
 TAKEN = (
     *SHARED,
     "nerf",
     "views",
-    "metrics.json",
-    "metrics.csv",
     "report",
     "export",
     "restored",
@@ -44,7 +43,7 @@ class ScenePaths:
             if name is not None and not NAME.fullmatch(name):
                 raise UserError(
                     f"{name!r} cannot name a scene or a variant.",
-                    "Use letters, digits, '.', '_' and '-', beginning with a letter or digit.",
+                    "Use letters, digits, '_' and '-', beginning with a letter or digit.",
                 )
         if self.variant in TAKEN:
             raise UserError(
