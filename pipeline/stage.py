@@ -106,7 +106,7 @@ def run(
         flags = parser.parse_args(sys.argv[1:])
         params_file = _params_file(flags.params)
         if before is not None:
-            before(params_file, flags)
+            _beforehand(before, params_file, flags)
         sys.exit(_run(name, params_type, main, params_file, flags))
     except UserError as error:
         print(f"{name}: {error.what}", file=sys.stderr)
@@ -127,6 +127,19 @@ def _by_its_name(main: Callable[..., Any]) -> Any:
     if main.__module__ != "__main__" or spec is None:
         return None
     return importlib.import_module(spec.name)
+
+
+def _beforehand(
+    before: Callable[[Path, argparse.Namespace], None], params_file: Path, flags: argparse.Namespace
+) -> None:
+    """Runs `before`; a folder that may not be read is a fault of the user's, as it is within a stage."""
+    try:
+        before(params_file, flags)
+    except OSError as error:
+        fault = place_fault(error, params_file.parent / "data" / flags.scene)
+        if fault is None:
+            raise
+        raise fault from error
 
 
 def _run(

@@ -224,6 +224,9 @@ def test_one_command_brings_a_folder_in(tmp_path: Path) -> None:
     assert (root / "params.yaml").read_text() == after
     bad = _from(root, "shed", tmp_path / "nowhere")
     assert bad.returncode == 2 and "nowhere does not exist" in bad.stderr
+    long = _from(root, "shed", tmp_path / ("x" * 300))
+    assert long.returncode == 2 and "Traceback" not in long.stderr
+    assert "xxx: cannot be read (File name too long)" in long.stderr
     assert (root / "params.yaml").read_text() == after and not (root / "data/shed").exists()
 
 
