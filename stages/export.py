@@ -35,9 +35,9 @@ class Params(Section):
 
 
 def main(job: Job, params: Params) -> str:
-    """Makes `artifacts/<scene>/export/` from the images, masks, poses and views there are."""
+    """Makes the scene's (or its variant's) `export/` from the images, masks, poses and views there are."""
     scene = read_straight(job.paths)
-    export = job.paths.artifacts / "export"
+    export = job.paths.out / "export"
     with publish_dir(export) as fresh:
         for name in params.formats:
             WRITERS[name](scene, fresh / name, params)

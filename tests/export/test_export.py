@@ -199,6 +199,14 @@ def test_photos_depth_and_points(made: Path) -> None:
         assert (made / "nerfstudio" / frame["mask_path"]).is_file()
 
 
+def test_a_variant_is_exported_beside_its_fit_not_over_its_scene(made: Path) -> None:
+    """The variant has no clean photos here; those of the scene must still be where they were."""
+    job = Job(made.parents[2], "made", "unmasked", "cpu", None, False)
+    export.main(job, PARAMS.model_copy(update={"formats": ["nerfstudio", "photos"]}))
+    assert len(list((made / "photos").iterdir())) == len(NAMES)
+    assert (made.parent / "unmasked/export/nerfstudio/transforms.json").is_file()
+
+
 def test_depths_that_no_other_view_confirms_are_left_out() -> None:
     """Three cameras before a wall at 2; one of them sees half of it at 3."""
     wall = np.full((20, 30), 2.0, np.float32)
