@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import publish_dir
+from pipeline.io.atomic import publish_dir, read_json
 from pipeline.io.given import GivenView, read_nerfstudio
 from pipeline.io.images import PHOTO_SUFFIXES
 from pipeline.io.llff import read_poses_bounds
@@ -196,6 +196,7 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
     elif source.is_dir():
         capture = find_capture(source, at_least, read_colmap)
         refuse_outside(source, capture)
+        _refuse_absolute(source, capture)
         root, files = source, _belonging(source, capture)
     else:
         raise UserError(f"{source} is no folder and no video.", "Name the folder of your photos.")
@@ -246,6 +247,19 @@ def refuse_outside(folder: Path, capture: Capture) -> None:
                 f"{folder / TRANSFORMS} names {path}, which lies outside of {folder}.",
                 "Copy all photos into one folder with it, and name them relative to it.",
             )
+
+
+def _refuse_absolute(folder: Path, capture: Capture) -> None:
+    """UserError for a photo or mask that transforms.json names from the root: a copy would not find its own."""
+    if capture.posed_by != "nerfstudio":
+        return
+    for frame in read_json(folder / TRANSFORMS)["frames"]:
+        for name in (frame["file_path"], frame.get("mask_path")):
+            if name and Path(name).is_absolute():
+                raise UserError(
+                    f"{folder / TRANSFORMS} names {name} by an absolute path.",
+                    "Name all photos and masks relative to it, so that they are found in a copy too.",
+                )
 
 
 def _belonging(source: Path, capture: Capture) -> list[Path]:

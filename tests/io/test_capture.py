@@ -401,6 +401,12 @@ def test_adopting_what_cannot_be_used_leaves_nothing(tmp_path: Path) -> None:
     _write(source, content)
     with pytest.raises(UserError, match="lies outside"):
         adopt(source, data, 3, _no_colmap)
+    _photos(source / "images")
+    for frame in content["frames"]:  # within, but not within the copy
+        frame["file_path"] = f"{source}/images/" + Path(frame["file_path"]).name
+    _write(source, content)
+    with pytest.raises(UserError, match=r"a\.jpg by an absolute path"):
+        adopt(source, data, 3, _no_colmap)
     with pytest.raises(UserError, match="nothing does not exist"):
         adopt(tmp_path / "nothing", data, 3, _no_colmap)
     with pytest.raises(UserError, match="no folder and no video"):
