@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.errors import UserError
-from pipeline.geometry.poses import as_4x4
+from pipeline.geometry.poses import as_4x4, centre
 from pipeline.io.given import GivenView, checked_camera
 from pipeline.io.transforms import View
 from pipeline.sfm.database import Progress, build_database
@@ -40,6 +40,7 @@ _MODELS: dict[str, tuple[int, tuple[str, ...], bool]] = {
 # Shares of matched features that become points. Measured: 0.77 and 0.83 with right poses, 0.12 and 0.06
 # with each photo's pose given to its neighbour or to the fifth from it.
 MISFIT, DOUBTFUL = 0.2, 0.5
+MOST_OFF_PX = 1.0  # that rounding to 32 bits may move what the cameras see
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _ORDER_FISHEYE = ("k1", "k2", "k3", "k4")
 
@@ -136,6 +137,7 @@ def triangulate(
     _check_fit(model, sum(matching.matched[name] for name in given), image_dir)
     views = {name: with_depths(view, model, depth_margin) for name, view in sorted(given.items())}
     _check_depths(views)
+    _check_origin(views)
     xyz, rgb, error = points_of(model)
     reprojection = model.compute_mean_reprojection_error() if len(xyz) else 0.0
     return Reconstructed(
@@ -196,6 +198,20 @@ def _check_depths(views: Mapping[str, View]) -> None:
         raise UserError(
             f"the photos show no points before {', '.join(blind)}: their depths stay unknown.",
             "Give near and far depths with the poses, or set poses.use_given: false.",
+        )
+
+
+def _check_origin(views: Mapping[str, View]) -> None:
+    """A fit counts in 32 bits: cameras in coordinates of the whole earth would stand where these end."""
+    views_off = [
+        np.finfo(np.float32).eps * np.linalg.norm(centre(view.cam_from_world)) * view.fx / view.near
+        for view in views.values()
+    ]
+    if (off := float(np.median(views_off))) > MOST_OFF_PX:
+        raise UserError(
+            "the poses that came with the photos lie so far from the origin of their world that a fit would "
+            f"see them {off:.0f} px off.",
+            "Take the place of one camera from all places, or set poses.use_given: false.",
         )
 
 

@@ -19,6 +19,7 @@ from pipeline.io.images import write_image
 from pipeline.io.masks import read_keep_mask, write_keep_mask
 from pipeline.io.transforms import View, read_transforms, write_transforms
 from pipeline.sfm import Settings, read_colmap, triangulate
+from pipeline.sfm.given import _check_origin
 from pipeline.stage import Job
 from stages import ingest, masks, poses
 
@@ -74,6 +75,20 @@ def test_colmap_cameras_that_are_none(tmp_path: Path, width, focal, place, told)
             read_colmap(tmp_path, [Path("a.jpg")])
     else:
         assert read_colmap(tmp_path, [Path("a.jpg")])[0].fx == 100.0
+
+
+@pytest.mark.parametrize("far_off", [1e3, 5e6])
+def test_poses_in_coordinates_of_the_whole_earth_are_refused(far_off: float) -> None:
+    """Metres of UTM: 32 bits know 5,000,000 to half a metre, some 20 px at 20 m."""
+    pose = np.eye(4)
+    pose[:3, 3] = 0.0, -far_off, 0.0
+    assert (far_off == 5e6) == (np.spacing(np.float32(far_off)) * 700 / 20 > 1)
+    views = {"a.png": View("a.png", pose, 700, 700, 400, 300, 0.0, 800, 600, 20.0, 90.0)}
+    if far_off == 5e6:
+        with pytest.raises(UserError, match=r"so far from the origin .* 21 px off"):
+            _check_origin(views)
+    else:
+        _check_origin(views)
 
 
 def test_given_poses_stay_and_points_tell_the_depths(scene, tmp_path):
