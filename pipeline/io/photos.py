@@ -179,14 +179,16 @@ def plan_sizes(
             f"{', '.join(Path(name).stem for name in copies)}"
         )
         return replace(plan, left_out=sorted([*plan.left_out, *copies]), said=[said, *plan.said])
-    choices = [dict(fixed_turns)] if fixed_turns is not None else _choices_of_turns(photos)
+    choices, why = _choices_of_turns(photos), "so that portrait and landscape have one size"
+    if fixed_turns is not None:
+        choices, why = [dict(fixed_turns)], "as the cameras that came along see them"
     for turns in choices:
         sizes = {photo.size_after(turns[name]) for name, photo in photos.items()}
         if len(sizes) == 1:
-            return Plan(turns, sizes.pop(), [], _said_of_turns(photos, turns))
+            return Plan(turns, sizes.pop(), [], _said_of_turns(photos, turns, why))
     if mixed == "refuse":
         raise _mixed_sizes(photos, choices[-1])
-    plans = [_scaled_together(photos, turns) for turns in choices]
+    plans = [_scaled_together(photos, turns, why) for turns in choices]
     best = min(plans, key=lambda plan: len(plan.left_out))
     if 2 * len(best.left_out) > len(photos):
         raise _mixed_sizes(photos, choices[-1])
@@ -201,16 +203,14 @@ def _choices_of_turns(photos: Mapping[str, Photo]) -> list[dict[str, int]]:
     return [upright, dict.fromkeys(photos, common)]
 
 
-def _said_of_turns(photos: Mapping[str, Photo], turns: Mapping[str, int]) -> list[str]:
+def _said_of_turns(photos: Mapping[str, Photo], turns: Mapping[str, int], why: str) -> list[str]:
     turned = sum(turns[name] != photos[name].upright_turn for name in turns)
     if not turned:
         return []
-    return [
-        f"{turned} of {len(turns)} photos stay turned, so that portrait and landscape have one size"
-    ]
+    return [f"{turned} of {len(turns)} photos stay turned, {why}"]
 
 
-def _scaled_together(photos: Mapping[str, Photo], turns: Mapping[str, int]) -> Plan:
+def _scaled_together(photos: Mapping[str, Photo], turns: Mapping[str, int], why: str) -> Plan:
     """The largest group of photos whose shapes agree, scaled to the smallest of them."""
     groups: list[list[str]] = []
     for name in sorted(photos, key=lambda name: (photos[name].ratio_after(turns[name]), name)):
@@ -224,7 +224,7 @@ def _scaled_together(photos: Mapping[str, Photo], turns: Mapping[str, int]) -> P
     left_out = sorted(photos.keys() - kept.keys())
     sizes = Counter(photos[name].size_after(turns[name]) for name in kept)
     smallest = min(sizes)
-    said = _said_of_turns(photos, kept)
+    said = _said_of_turns(photos, kept, why)
     if len(sizes) > 1:
         counts = ", ".join(f"{count} of {w}x{h}" for (w, h), count in sizes.most_common())
         said.append(f"the photos have mixed sizes ({counts}); all are scaled to the smallest")

@@ -111,6 +111,8 @@ def test_given_poses_decide_whether_the_metadata_turns_a_photo(
     assert bright.min() > 0.9
     record = read_images_json(images)[0]
     assert record.turned == (0 if upright else 90)
+    turned = ["3 of 3 photos stay turned, as the cameras that came along see them"]
+    assert read_origin(images).said == ([] if upright else turned), "no photo is a landscape"
     assert record.source == "images/a.jpg"
 
 
