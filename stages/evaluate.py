@@ -76,7 +76,8 @@ def _files(job: Job, records: Sequence[ImageRecord]) -> dict[str, Files]:
             source=paths.data / record.source,
             photo=paths.images / record.name,
             keep_mask=paths.refine / record.name,
-            test=view("test", record.name),
+            # A variant may show all of its photos there, those to learn from too (experiments/tables/).
+            test=view("test", record.name) if record.split == "test" else None,
             fitted=view("input", record.name) or view("test", record.name),
             composite=view("composite", record.name),
             clean=clean[record.name] if clean else None,

@@ -96,6 +96,18 @@ def test_covered_and_kept_pixels_are_judged_apart(tmp_path):
     assert after["covered"]["psnr"] < before["covered"]["psnr"] - 10
 
 
+def test_only_held_out_views_are_test_views(tmp_path):
+    """A remover's photos lie in test/ all together: those that are not held out have no say."""
+    paths = fabricate(tmp_path)
+    before, closing = evaluate(tmp_path)
+    for path in (paths.views / "input").iterdir():
+        write_image(paths.views / "test" / path.name, np.zeros_like(read_image(path)))
+    after, again = evaluate(tmp_path)
+    for group in ("test", "covered", "kept", "selfcheck"):
+        assert after[group] == before[group]
+    assert closing == again
+
+
 def test_photos_turned_by_ingest_find_their_references(tmp_path):
     """The same scene with one photo stored on its side gives the same numbers."""
     paths = fabricate(tmp_path)
