@@ -57,8 +57,11 @@ def _dvc(*words: str) -> list[str]:
     return [sys.executable, "-m", "dvc", *words]
 
 
-def _repro(folder: Path, targets: Sequence[str]) -> None:
-    """Makes the targets, on one core each at a time; failures are told by DVC and do not stop the rest."""
+def _repro(folder: Path, targets: Sequence[str]) -> bool:
+    """Makes the targets, on one core each at a time; whether all were made.
+
+    Failures are told by DVC and do not stop the rest.
+    """
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     running = []
     for worker in range(min(cores(), len(targets))):
@@ -73,15 +76,14 @@ def _repro(folder: Path, targets: Sequence[str]) -> None:
 
         running.append(subprocess.Popen(command, cwd=folder, env=_environment(), preexec_fn=pinned))
     try:
-        for process in running:
-            process.wait()
+        return not any([process.wait() for process in running])
     finally:
         for process in running:
             process.terminate()
 
 
 def main() -> int:
-    """Runs the phases; 1 when the last tables could not be made by DVC, that is, when something failed."""
+    """Runs the phases; 1 when anything could not be made, be it a row that the tables then miss."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=PROFILES)
@@ -94,15 +96,16 @@ def main() -> int:
     scenes = sorted({name.split("@")[1] for name in listed.stdout.split() if "prepare@" in name})
     rendered = [f"scene@{scene}" for scene in scenes]
     subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes", check=True)
+    made = True
     for what, targets in phases(listed.stdout.split()):
         print(f"[{(time.monotonic() - start) / 60:5.1f} min] {what}: {len(targets)}", flush=True)
-        _repro(folder, targets)
+        made &= _repro(folder, targets)
         subprocess.run(table, cwd=folder, env=_environment(), check=False)
     done = subprocess.run(
         _dvc("repro", "--quiet", "--single-item", "table"), cwd=folder, env=_environment()
     )
     print(f"[{(time.monotonic() - start) / 60:5.1f} min] {folder / 'tables' / 'tables.md'}")
-    return 1 if done.returncode else 0
+    return 0 if made and done.returncode == 0 else 1
 
 
 if __name__ == "__main__":

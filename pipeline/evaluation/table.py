@@ -27,6 +27,16 @@ COLUMNS = (
 )
 MISSING = "-"
 LIKE_THE_ONE_BEFORE = {"composite.ssim": "composite SSIM"}  # headings that say too little alone
+# Where fits differ in the first of these, their numbers of the others are means over other pixels or photos.
+UNLIKE = (
+    (
+        "masks.coverage",
+        ("covered.psnr", "kept.psnr", "selfcheck.kept_psnr"),
+        "masks differ",
+        "pixels",
+    ),
+    ("input.psnr", ("composite.psnr", "composite.ssim", "input.psnr"), "photos differ", "photos"),
+)
 
 
 def look_up(metrics: Mapping[str, Any], name: str) -> float | None:
@@ -47,10 +57,10 @@ def reasons(metrics: Mapping[str, Any]) -> dict[str, str]:
 
 
 def table(fits: Mapping[str, Mapping[str, Any]]) -> str:
-    """An aligned Markdown table, one row per fit by label, then why numbers are missing.
+    """An aligned Markdown table, one row per fit by label, then what cannot be compared, and what is missing.
 
     Columns that no fit has a number for are left out; "PSNR to photos" is that of held-out views to the
-    photos beside the drops.
+    photos beside the drops. Covered and kept are the pixels of each fit's own masks.
     """
     columns = [
         one for one in COLUMNS if any(look_up(fit, one[1]) is not None for fit in fits.values())
@@ -64,7 +74,7 @@ def table(fits: Mapping[str, Mapping[str, Any]]) -> str:
     lines = [_line(row, widths) for row in rows]
     rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
     lines.insert(1, _line(rule, widths))
-    return "\n".join([*lines, *_notes(fits)]) + "\n"
+    return "\n".join([*lines, *_unlike(fits), *_notes(fits)]) + "\n"
 
 
 def gains(fits: Mapping[str, Mapping[str, Any]]) -> str:
@@ -100,6 +110,20 @@ def _line(row: Sequence[str], widths: Sequence[int]) -> str:
     cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
     cells[0] = row[0].ljust(widths[0])
     return "| " + " | ".join(cells) + " |"
+
+
+def _unlike(fits: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    told = {name: LIKE_THE_ONE_BEFORE.get(name, heading) for heading, name, _ in COLUMNS}
+    lines = []
+    for ruler, names, why, what in UNLIKE:
+        known = [
+            name for name in names if sum(look_up(f, name) is not None for f in fits.values()) > 1
+        ]
+        values = {look_up(fit, ruler) for fit in fits.values()} - {None}
+        if known and len(values) > 1:
+            headings = ", ".join(told[name] for name in known)
+            lines.append(f"The fits' {why}: each is judged on {what} of its own in {headings}.")
+    return lines
 
 
 def _notes(fits: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -33,6 +33,22 @@ def test_what_cannot_be_measured_is_told_once_under_its_heading():
     ]
 
 
+def test_numbers_of_other_pixels_or_photos_are_told_apart():
+    """Covered are the pixels of a fit's own masks; composites are of all photos that were rendered."""
+    own = {"masks": {"coverage": 0.2}, "covered": {"psnr": 20.0}, "kept": {"psnr": 30.0}}
+    own |= {"input": {"psnr": 21.0}, "composite": {"psnr": 31.0, "ssim": None}}
+    assert "differ" not in table({"a": own, "b": own})
+    lines = table({"a": own, "b": own | {"masks": {"coverage": 0.25}}}).splitlines()
+    assert lines[4:] == [
+        "The fits' masks differ: each is judged on pixels of its own in covered PSNR, kept PSNR."
+    ]
+    lines = table({"a": own, "b": own | {"input": {"psnr": 22.0}}}).splitlines()
+    assert lines[4:] == [
+        "The fits' photos differ: each is judged on photos of its own in composite PSNR, photo PSNR."
+    ]
+    assert "differ" not in table({"a": own, "b": {"masks": {"coverage": 0.25}}})
+
+
 def test_the_gain_is_told_when_both_are_known():
     assert (
         gains({"demo": MASKED, "raw": UNMASKED}) == "demo over raw: +6.46 dB on held-out views.\n"

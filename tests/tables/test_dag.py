@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib
 import re
+import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
 import yaml
 
+from experiments.tables import run
 from experiments.tables.run import PROFILES, phases
 from pipeline.params import read_folders, read_params, read_section, stage_names
 from pipeline.tables.rows import ROWS
@@ -97,3 +100,22 @@ def test_one_seed_of_everything_comes_before_the_next() -> None:
         ["fit@a-nerf-1", "loop@a-1"],
         ["cleaned@a-wen-1"],
     ]
+
+
+def test_a_row_that_failed_is_told_by_the_exit_code(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """DVC makes the tables of what there is: that they were made says nothing of the rows."""
+    code = "import sys; sys.exit('fit@a-nerf-1' in sys.argv)"
+    monkeypatch.setattr(run, "_dvc", lambda *words: [sys.executable, "-c", code, *words])
+    monkeypatch.setattr(run, "cores", lambda: 2)
+    monkeypatch.setattr(run.signal, "signal", lambda number, how: None)
+    monkeypatch.setattr(sys, "argv", ["run", "tiny"])
+
+    def runs(targets: str) -> int:
+        done = CompletedProcess([], 0, stdout=targets)
+        monkeypatch.setattr(run.subprocess, "run", lambda *words, **how: done)
+        return run.main()
+
+    assert runs("prepare@a fit@a-nerf-0 fit@a-true-0 table") == 0
+    assert runs("prepare@a fit@a-nerf-0 fit@a-nerf-1 table") == 1
