@@ -83,15 +83,18 @@ def write_image(path: Path, rgb: np.ndarray) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of the stored pixels, read from the file's header; OSError when it tells none."""
+    """(width, height) of the stored pixels, from the file's header; OSError when it tells none or too many."""
     can_read(path.suffix.lower())  # registers what reads HEIC, once in every process
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path) as photo:
-                return photo.size
+                width, height = photo.size
     except (SyntaxError, ValueError) as error:
         raise OSError(str(error)) from error
+    if width * height > MAX_PIXELS:
+        raise OSError(f"{path} claims {width}x{height} pixels")
+    return width, height
 
 
 @cache
