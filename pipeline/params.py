@@ -69,11 +69,10 @@ def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         below = read_params(file.parent / str(content[BASE]), (*above, file.resolve()))
         content = _upon(file, below, content)
     for kind in NAMED:
-        if not content.get(kind):
-            continue
-        choices = _mapping(file, kind, content[kind])
-        content[kind] = {str(name): values for name, values in choices.items()}
-        for name, values in content[kind].items():
+        _mapping(file, kind, content.get(kind) or {})
+    content = _by_names(content)
+    for kind in NAMED:
+        for name, values in (content.get(kind) or {}).items():
             overrides = _mapping(file, f"{kind}.{name}", values or {})
             allowed = [*stage_names(), *([FOLDERS] if kind == "variants" else [])]
             _refuse_unknown(file, f"section in {kind}.{name}", overrides, allowed)
@@ -175,7 +174,7 @@ def _as_key(name: str) -> str:
 
 
 def _by_names(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a file with the names of its scenes and variants as text, as `read_params` has them."""
+    """The content of a file with the names of its scenes and variants as text: YAML makes 7 of 007."""
     named = {kind: content[kind] for kind in NAMED if content.get(kind)}
     return {
         **content,
