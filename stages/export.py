@@ -48,8 +48,8 @@ def _nerfstudio(scene: StraightScene, folder: Path, params: Params) -> None:
     for image in scene.images:
         write_image(folder / "images" / image.view.name, image.rgb)
         write_keep_mask(folder / "masks" / image.view.name, image.keep_mask)
-    write_ply(folder / "sparse_pc.ply", *sparse_points(read_sparse(scene.paths.poses / "sparse")))
-    views, extras = [image.view for image in scene.images], {"ply_file_path": "sparse_pc.ply"}
+    write_ply(folder / "sparse_pc.ply", *sparse_points(read_sparse(scene.sparse)), scene.origin)
+    views, extras = [i.view.as_given for i in scene.images], {"ply_file_path": "sparse_pc.ply"}
     write_transforms(folder / "transforms.json", views, extras, beside="")
 
 
@@ -57,7 +57,7 @@ def _colmap(scene: StraightScene, folder: Path, params: Params) -> None:
     for image in scene.images:
         write_image(folder / "images" / image.view.name, scene.straight_rgb(image))
         write_keep_mask(folder / "masks" / f"{image.view.name}.png", scene.straight_keep(image))
-    write_straight(read_sparse(scene.paths.poses / "sparse"), scene.straight, folder / "sparse/0")
+    write_straight(read_sparse(scene.sparse), scene.straight, folder / "sparse/0")
 
 
 def _llff(scene: StraightScene, folder: Path, params: Params) -> None:
@@ -73,7 +73,7 @@ def _llff(scene: StraightScene, folder: Path, params: Params) -> None:
 
 
 def _ply(scene: StraightScene, folder: Path, params: Params) -> None:
-    write_ply(folder / "sparse.ply", *sparse_points(read_sparse(scene.paths.poses / "sparse")))
+    write_ply(folder / "sparse.ply", *sparse_points(read_sparse(scene.sparse)), scene.origin)
     views = []
     for image in scene.images:
         view, depth = scene.straight[image.view.name], scene.straight_depth(image.view)
@@ -84,7 +84,7 @@ def _ply(scene: StraightScene, folder: Path, params: Params) -> None:
         log.warning("no dense points: run `python -m stages.render` for depth maps")
         return
     dense = fuse(views, step=params.dense_step, agreeing=params.dense_agreeing)
-    write_ply(folder / "dense.ply", *dense)
+    write_ply(folder / "dense.ply", *dense, scene.origin)
 
 
 def _depth(scene: StraightScene, folder: Path, params: Params) -> None:

@@ -16,7 +16,7 @@ from pipeline.io.lenses import lens_of
 from pipeline.io.masks import fit_mask, read_foreign_mask, read_rain_mask, write_keep_mask
 from pipeline.io.photos import Photo, Plan
 from pipeline.io.scene import ImageRecord
-from pipeline.io.transforms import View
+from pipeline.io.transforms import View, near_origin
 
 SUSPECT = 0.6  # a set of masks that drops more than this is likely upside down
 FEW = 12  # photos; a rule of thumb: docs/capture.md advises 20 to 40
@@ -104,12 +104,16 @@ def photo_records(
 def given_views(
     capture: Capture, plan: Plan, size: tuple[int, int], straighten: Mapping[str, Straightener]
 ) -> list[View]:
-    """The capture's views for the images (of `size`) that its photos become, in name order."""
-    return [
+    """The capture's views for the images (of `size`) that its photos become, in name order.
+
+    Those far from the origin are moved to one in their midst.
+    """
+    views = [
         (straighten[name].straight if name in straighten else view).view(name, size)
         for name, view in sorted(capture.views.items())
         if name in plan.turns
     ]
+    return near_origin(views) if views else []
 
 
 def given_masks(capture: Capture) -> Iterator[tuple[str, np.ndarray]]:

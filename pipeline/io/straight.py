@@ -14,7 +14,7 @@ from pipeline.io.masks import fit_mask
 from pipeline.io.paths import ScenePaths
 from pipeline.io.posed import PosedImage, read_posed_images
 from pipeline.io.straighten import common_pinholes, straighteners_to
-from pipeline.io.transforms import View, read_transforms
+from pipeline.io.transforms import Place, View, read_transforms
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,16 @@ class StraightScene:
     images: list[PosedImage]
     straight: dict[str, View]
     straighten: dict[str, Straightener]
+
+    @property
+    def origin(self) -> Place:
+        """Where the world's origin lies in the coordinates that the capture came with."""
+        return self.images[0].view.origin
+
+    @property
+    def sparse(self) -> Path:
+        """The folder of the COLMAP model, in the scene's own world."""
+        return self.paths.poses / "sparse"
 
     def straight_rgb(self, image: PosedImage) -> np.ndarray:
         """The photo (H, W, 3) in [0, 1] as the common pinhole shows it."""

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.errors import UserError
-from pipeline.io.transforms import View
+from pipeline.io.transforms import ORIGIN, View
 from pipeline.sfm.model import points_of
 
 
@@ -35,7 +35,8 @@ def write_straight(
 ) -> None:
     """Writes the images `straight` (pinholes, by name) of `model` with its points, binary, to `folder`.
 
-    Observations move to where the straight images show them; points keep their tracks.
+    Observations move to where the straight images show them; points keep their tracks. Both lie in the
+    coordinates that the capture came with.
     """
     out = pycolmap.Reconstruction()
     first = next(iter(straight.values()))
@@ -75,6 +76,8 @@ def write_straight(
         if len(track.elements) >= 2:
             out.add_point3D(point.xyz, track, point.color)
     out.update_point_3d_errors()
+    if first.origin != ORIGIN:
+        out.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(first.origin)))
     folder.mkdir(parents=True, exist_ok=True)
     out.write_binary(str(folder))
 

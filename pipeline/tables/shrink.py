@@ -44,4 +44,4 @@ def smaller_view(view: View, size: tuple[int, int]) -> View:
 
     Pixel (0, 0)'s centre is (0.5, 0.5), so intrinsics scale with the picture and nothing is added.
     """
-    return of_view(view).view(view.name, size)
+    return replace(of_view(view).view(view.name, size), origin=view.origin)

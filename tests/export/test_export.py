@@ -229,5 +229,9 @@ def test_points_and_rows_come_back(tmp_path: Path) -> None:
     xyz, rgb = np.random.default_rng(1).normal(size=(7, 3)), np.full((7, 3), 9, np.uint8)
     write_ply(tmp_path / "p.ply", xyz, rgb)
     assert np.allclose(read_ply(tmp_path / "p.ply")[0], xyz, atol=1e-6)
+    utm = (4e5, 5e6, 0.0)
+    write_ply(tmp_path / "far.ply", xyz, rgb, utm)
+    far, colours = read_ply(tmp_path / "far.ply")
+    assert np.allclose(far - utm, xyz, rtol=0, atol=1e-8) and (colours == rgb).all()
     shuffled = poses_bounds([replace(view, k1=0.0) for view in reversed(VIEWS)])
     assert shuffled[:, 3].tolist() == pytest.approx([0.0, 0.1, 0.2]), "rows go by name"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import struct
 import time
 import zlib
@@ -23,9 +24,17 @@ from pipeline.io.masks import read_foreign_mask, read_keep_mask, write_keep_mask
 from pipeline.io.posed import posed_records, read_posed_images
 from pipeline.io.scene import ImageRecord, read_images_json, write_images_json
 from pipeline.io.tensors import load_tensors, save_tensors
-from pipeline.io.transforms import View, read_transforms, write_transforms
+from pipeline.io.transforms import (
+    FAR_OFF,
+    ORIGIN,
+    View,
+    near_origin,
+    read_transforms,
+    write_transforms,
+)
 from pipeline.io.video import write_video
 from pipeline.io.weights import fill, read_state
+from pipeline.tables.shrink import smaller_view
 
 
 @pytest.fixture
@@ -161,6 +170,45 @@ def test_the_file_holds_opengl_axes(tmp_path: Path) -> None:
 
     matrix = json.loads((tmp_path / "t.json").read_text())["frames"][0]["transform_matrix"]
     assert np.array_equal(np.array(matrix), np.diag([1, -1, -1, 1]))
+
+
+def test_poses_far_from_the_origin_are_moved_and_say_from_where(tmp_path: Path) -> None:
+    """Poses up to FAR_OFF stay to the last bit, and nothing is written down for them."""
+    near, far = [], []
+    for number in range(3):
+        pose = np.eye(4)
+        pose[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+        pose[:3, 3] = -pose[:3, :3] @ [FAR_OFF - 10, number, 0.5]
+        view = View(f"{number}.png", pose, 70, 70, 40, 30, 0.0, 80, 60, 1.0, 9.0)
+        near.append(view)
+        pose = pose.copy()
+        pose[:3, 3] = -pose[:3, :3] @ [4e5 + 0.25, 5e6 + number, 300.25]
+        far.append(replace(view, cam_from_world=pose))
+    assert all(a is b for a, b in zip(near_origin(near), near, strict=True))
+    write_transforms(tmp_path / "near.json", near_origin(near))
+    assert "world_origin" not in (tmp_path / "near.json").read_text()
+    write_transforms(tmp_path / "far.json", near_origin(far))
+    for view in read_transforms(tmp_path / "far.json").values():
+        assert view.origin == (4e5, 5e6 + 1, 300)
+        number = int(view.name[0])
+        assert view.world_from_cam[:3, 3].tolist() == pytest.approx([0.25, number - 1, 0.25])
+        back = view.as_given
+        assert back.origin == ORIGIN
+        assert np.allclose(back.cam_from_world, far[number].cam_from_world, rtol=0, atol=1e-8)
+    half = smaller_view(near_origin(far)[0], (40, 30))
+    assert half.origin == (4e5, 5e6 + 1, 300), "a smaller picture has the same world"
+
+
+@pytest.mark.parametrize("origin", ["[1, 2]", '"here"', "[1, 2, NaN]", "7"])
+def test_an_origin_that_is_no_place_is_refused(tmp_path: Path, origin: str) -> None:
+    view = View("0.png", np.eye(4), 70, 70, 40, 30, 0.0, 80, 60, 1.0, 9.0, (1e5, 0.0, 0.0))
+    path = tmp_path / "t.json"
+    write_transforms(path, [view])
+    words = re.sub(r'("world_origin": )\[[^]]*\]', rf"\g<1>{origin}", path.read_text())
+    assert origin in words
+    path.write_text(words)
+    with pytest.raises(UserError, match=r"t\.json"):
+        read_transforms(path)
 
 
 def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path) -> None:

@@ -17,11 +17,12 @@ from pipeline.errors import UserError
 from pipeline.io.capture import find_capture
 from pipeline.io.images import write_image
 from pipeline.io.masks import read_keep_mask, write_keep_mask
+from pipeline.io.ply import read_ply
 from pipeline.io.transforms import View, read_transforms, write_transforms
 from pipeline.sfm import Settings, read_colmap, triangulate
 from pipeline.sfm.given import _check_origin
 from pipeline.stage import Job
-from stages import ingest, masks, poses
+from stages import export, ingest, masks, poses
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 SETTINGS = Settings(
@@ -78,8 +79,8 @@ def test_colmap_cameras_that_are_none(tmp_path: Path, width, focal, place, told)
 
 
 @pytest.mark.parametrize("far_off", [1e3, 5e6])
-def test_poses_in_coordinates_of_the_whole_earth_are_refused(far_off: float) -> None:
-    """Metres of UTM: 32 bits know 5,000,000 to half a metre, some 20 px at 20 m."""
+def test_poses_too_far_from_their_origin_for_a_fit_are_refused(far_off: float) -> None:
+    """What `ingest` did not move: 32 bits know 5,000,000 to half a metre, some 20 px at 20 m."""
     pose = np.eye(4)
     pose[:3, 3] = 0.0, -far_off, 0.0
     assert (far_off == 5e6) == (np.spacing(np.float32(far_off)) * 700 / 20 > 1)
@@ -223,3 +224,41 @@ def test_a_capture_with_poses_and_masks_goes_through_the_stages(scene, tmp_path)
     account = json.loads((job.paths.poses / "poses.json").read_text())
     assert account["tried"][0]["label"] == "poses as given" and account["lost"] == []
     assert account["aligned"] is False
+
+
+def test_poses_in_coordinates_of_the_whole_earth_come_back_on_export(scene, tmp_path):
+    """Metres of UTM: the fit's own world begins among the cameras, what is exported lies where it was."""
+    utm = np.array([412345.678, 5_654_321.25, 312.5])
+    data = tmp_path / "data/made"
+    shutil.copytree(scene.images, data / "images")
+    given = true_views(scene)
+    for name, view in given.items():
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ utm
+        given[name] = dataclasses.replace(view, cam_from_world=pose)
+        write_keep_mask(data / "masks" / name, np.ones((HEIGHT, WIDTH), np.bool_))
+    write_transforms(data / "transforms.json", given.values(), beside="")
+    job = Job(tmp_path, "made", None, "cpu", None, False)
+    params = YAML(typ="safe").load((Path(__file__).parents[2] / "params.yaml").read_text())
+    ingest.main(job, ingest.Params(**params["ingest"]))
+    masks.main(job, masks.Params(**params["masks"]))
+    poses.main(job, poses.Params(**params["poses"]))
+    for view in read_transforms(job.paths.poses / "transforms.json").values():
+        assert np.abs(view.world_from_cam[:3, 3]).max() < 5 and 0 < view.near < 2.9 < view.far
+    wanted = export.Params(
+        **{**params["export"], "formats": ["nerfstudio", "colmap", "llff", "ply"]}
+    )
+    export.main(job, wanted)
+    out = job.paths.artifacts / "export"
+    for door in ("nerfstudio", "colmap", "llff"):
+        for name, view in find_capture(out / door, 3, read_colmap).views.items():
+            there = np.linalg.inv(view.cam_from_world)
+            assert np.allclose(there, given[name].world_from_cam, rtol=0, atol=1e-7)
+    model = pycolmap.Reconstruction(str(out / "colmap/sparse/0"))
+    assert model.compute_mean_reprojection_error() < 0.5
+    in_model = np.array([point.xyz for point in model.points3D.values()])
+    in_cloud = read_ply(out / "ply/sparse.ply")[0]
+    assert np.array_equal(read_ply(out / "nerfstudio/sparse_pc.ply")[0], in_cloud)
+    for points in (in_model, in_cloud):
+        off = np.abs(points[:, 2:] - utm[2] - [[5.0, 3.6, 2.9]]).min(axis=1)
+        assert np.median(off) < 0.03 and np.abs(points - utm).max() < 20
