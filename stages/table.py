@@ -21,6 +21,7 @@ from pipeline.tables import compose
 from pipeline.tables.crops import busiest_window, side_by_side
 from pipeline.tables.reading import gathered_scores, mask_scores, read_view_scores
 from pipeline.tables.rows import ROWS, Row
+from pipeline.tables.settings import noted
 from pipeline.tables.writers import as_csv, latex, markdown
 
 PICTURES = {
@@ -43,7 +44,7 @@ def main(job: Job, params: Params) -> str:
     """Makes `tables/`: each table as Markdown, CSV and LaTeX, and one strip of crops per scene."""
     found: dict[tuple[str, str, str], dict[int, float]] = defaultdict(dict)
     missing: dict[tuple[str, str], str] = {}
-    poses, conventions = {}, {}
+    poses, conventions, made = {}, {}, {}
     for scene in params.scenes:
         for row in ROWS:
             lacking = []
@@ -54,6 +55,7 @@ def main(job: Job, params: Params) -> str:
                     missing[scene, row.id] = _why(row, scene, params, lacking)
                     continue
                 metrics = read_metrics(paths.metrics)
+                made[scene, row.key, seed] = paths.metrics
                 poses[scene], conventions = metrics["poses"], metrics["conventions"]
                 scores = read_view_scores(paths.metrics_csv, row)
                 if row.id in ("unaveraged", "derain", "loop"):
@@ -65,15 +67,16 @@ def main(job: Job, params: Params) -> str:
     if not poses:
         raise UserError("No row of the comparison has metrics yet.", "Run `make tables` first.")
     told = [*params.notes, *(f"{name}: {conventions[name]}." for name in ("psnr", "ssim", "flip"))]
-    told.append(_lpips(found, str(conventions["lpips_net"])))
-    tables = (
+    told.append(compose.lpips_note(found, str(conventions["lpips_net"])))
+    tables = [
         compose.comparison(found, params.scenes, missing, told),
         compose.paper_comparison(),
         compose.gains(found, params.scenes, missing),
         compose.ablation(found, params.lens, missing),
         compose.mask_quality(found, params.scenes, missing, float(conventions["mask_threshold"])),
         compose.pose_quality(poses, params.scenes),
-    )
+    ]
+    tables = noted(tables, job.root, made)
     with publish_dir(job.paths.tables) as fresh:
         for table in tables:
             write_text(fresh / f"{table.name}.csv", as_csv(table))
@@ -91,12 +94,6 @@ def _why(row: Row, scene: str, params: Params, lacking: list[int]) -> str:
         return "equation 5 is for drops on the lens; without it the masks are those of the next row"
     some = row.seeded and lacking != params.seeds
     return "not computed" + (f" for seed {', '.join(map(str, lacking))}" if some else "")
-
-
-def _lpips(scores: compose.Scores, net: str) -> str:
-    if any(name == "lpips" for _, _, name in scores):
-        return f"LPIPS: {net}."
-    return f"LPIPS ({net}) is left out: its weights cannot be shipped; see evaluate.lpips_backbone."
 
 
 def _strip(paths: ScenePaths, seed: int, out: Path) -> None:

@@ -48,6 +48,13 @@ def comparison(
                  gaps, notes=tuple(notes))  # fmt: skip
 
 
+def lpips_note(scores: Scores, net: str) -> str:
+    """What the comparison says of LPIPS, by the network `net`."""
+    if any(name == "lpips" for _, _, name in scores):
+        return f"LPIPS: {net}."
+    return f"LPIPS ({net}) is left out: its weights cannot be shipped; see evaluate.lpips_backbone."
+
+
 def paper_comparison() -> Table:
     """The paper's Table I, on its scenes and with its numbers."""
     lines = tuple(Line(name, name) for name in PAPER)

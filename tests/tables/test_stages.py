@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from pipeline.errors import UserError
 from pipeline.io.images import read_image, write_image
@@ -17,6 +18,7 @@ from pipeline.io.paths import ScenePaths
 from pipeline.io.scene import read_images_json
 from pipeline.io.transforms import read_transforms
 from pipeline.stage import Job
+from pipeline.tables.settings import read_recorded, unlike
 from stages import evaluate, shrink, table
 from tests.evaluation.fabricated import fabricate
 
@@ -96,6 +98,82 @@ def test_tables_of_what_there_is(paths: ScenePaths, tmp_path: Path) -> None:
     assert (
         strip.shape[1] == 4 * 32 + 3 * 4
     )  # wet, NeRF, ours, clean: half the width, twice enlarged
+
+
+def _locked(root: Path, steps: dict[str, int], code: dict[str, str]) -> None:
+    """What DVC writes down of the rows' fits, as far as the tables read it."""
+    entries = {
+        f"fit@made-{name}": {
+            "cmd": "fit",
+            "deps": [
+                {"path": "../pipeline/field", "md5": code.get(name, "1.dir")},
+                {"path": f"artifacts/made/{name}/own", "md5": name},
+            ],
+            "params": {
+                "params.yaml": {"nerf": {"steps": count, "rate": 1e-05}},
+                "../params.yaml": {
+                    f"variants.{name}": {
+                        "folders": {"refine": f"{name}/refine"},
+                        "nerf": {"seed": int(name[-1])},
+                    }
+                },
+            },
+            "outs": [
+                {"path": f"artifacts/made/{name}/{file}"} for file in ("views", "metrics.json")
+            ],
+        }
+        for name, count in steps.items()
+    }
+    with (root / "dvc.lock").open("w") as file:
+        YAML().dump({"schema": "2.0", "stages": entries}, file)
+
+
+def test_rows_that_were_not_made_alike_are_told(paths: ScenePaths, tmp_path: Path) -> None:
+    """Between the phases of a run after a change, new seeds stand beside old ones."""
+    names = ("nerf-0", "nerf-1", "loop-0", "loop-1")
+    for name in names:
+        row(tmp_path, name, 10)
+    same = dict.fromkeys(names, 800)
+    _locked(tmp_path, same, {})
+    table.main(job(tmp_path), PARAMS)
+    assert "alike" not in (tmp_path / "tables/tables.md").read_text(), "seeds may differ"
+    told = r"Not made alike: NeRF \(seed 1\) had another nerf of params\.yaml than the rest\."
+    _locked(tmp_path, same | {"nerf-1": 600}, {})
+    table.main(job(tmp_path), PARAMS)
+    text = (tmp_path / "tables/tables.md").read_text()
+    sections = {part.split("\n")[0]: part for part in text.split("\n## ")[1:]}
+    with_it = [name for name, part in sections.items() if re.search(told, part)]
+    assert len(with_it) == 4 and not {"Poses", "The paper's own Table I"} & set(with_it)
+    assert "Not made alike" in (tmp_path / "tables/comparison.tex").read_text()
+    _locked(tmp_path, same, {"loop-0": "2.dir"})
+    table.main(job(tmp_path), PARAMS)
+    told = "DerainNeRF with the loop (ours) (seed 0) had another ../pipeline/field than the rest."
+    assert told in (tmp_path / "tables/tables.md").read_text()
+
+
+def test_scenes_are_named_where_they_were_not_made_alike() -> None:
+    known = {(scene, "nerf", seed): {"a": "1"} for scene in "xyz" for seed in (0, 1)}
+    assert unlike(known) == []
+    known["x", "nerf", 1] = known["y", "nerf", 1] = {"a": "2", "other": "3"}
+    known["z", "attgan", 0] = {"a": "2"}
+    (told,) = unlike(known)
+    assert told.startswith("Not made alike: NeRF (x, y; seed 1); AttGAN had another a than")
+    known |= {("z", "nerf", 1): {"a": "2"}}
+    assert unlike(known)[0].count("seed 0") == 1, "of two halves one is told"
+
+
+def test_what_dvc_itself_writes_is_read(tmp_path: Path) -> None:
+    lock = Path(__file__).resolve().parents[2] / "experiments/scenes/dvc.lock"
+    made = read_recorded(lock)["data/street"]
+    assert "synthesize of params.yaml" in made and made["../../pipeline/drops"].endswith(".dir")
+    assert read_recorded(tmp_path / "none.lock") == {}
+
+
+@pytest.mark.parametrize("text", ["stages: [1]", "stages: {a: {outs: [{}]}}", "a: [", "7"])
+def test_a_damaged_lock_file_is_told(tmp_path: Path, text: str) -> None:
+    (tmp_path / "dvc.lock").write_text(text)
+    with pytest.raises(UserError, match=r"dvc\.lock is not a lock file of DVC"):
+        read_recorded(tmp_path / "dvc.lock")
 
 
 def test_without_any_metrics_a_sentence(paths: ScenePaths, tmp_path: Path) -> None:
