@@ -35,7 +35,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Picked:
-    """The frames chosen of a video, when its last picture was shown, and how long it says that it is.
+    """The frames chosen of a video, until when its last picture is shown, and how long it says that it is.
 
     `told` is 0 where the file does not say. Both in seconds.
     """
@@ -67,14 +67,14 @@ def pick_frames(path: Path, count: int) -> Picked:
     """
     frames: list[Frame] = []
     motion, sharpness = [], []
-    last: np.ndarray | None = None
+    last, lasting = None, 0.0
     for index, frame in enumerate(_decoded(path)):
         glance = _grey(frame, GLANCE_PX)
         motion.append(0.0 if last is None else _median_flow(last, glance))
         sharpness.append(float(cv2.Laplacian(_grey(frame, LOOK_PX), cv2.CV_32F).var()))
         turned = round(frame.rotation / 90) * 90 % 360
         frames.append(Frame(index, round(float(frame.time or 0.0), 3), turned))
-        last = glance
+        last, lasting = glance, float((frame.duration or 0) * (frame.time_base or 0))
     if not frames:
         raise UserError(
             f"{path} holds no frames.", "Copy it again, or save frames of it as photos."
@@ -85,7 +85,9 @@ def pick_frames(path: Path, count: int) -> Picked:
             f"{path}: the camera hardly moves.", "A scene needs a video from different places."
         )
     chosen = choose(way, np.array(sharpness), count)
-    return Picked([frames[index] for index in chosen], frames[-1].seconds, _told_seconds(path))
+    # Of one picture a second the last counts much; where it does not say how long, as the one before.
+    end = frames[-1].seconds + (lasting or frames[-1].seconds - frames[-2].seconds)
+    return Picked([frames[index] for index in chosen], end, _told_seconds(path))
 
 
 def choose(way: np.ndarray, sharpness: np.ndarray, count: int) -> list[int]:

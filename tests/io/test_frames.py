@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
+from pipeline.io import frames
 from pipeline.io.frames import choose, pick_frames, read_frames, save_frames
 from pipeline.io.images import image_size
 from pipeline.io.video import write_video
@@ -96,20 +97,38 @@ def test_what_is_no_video_and_what_does_not_move_is_refused(tmp_path: Path) -> N
 @pytest.mark.parametrize("kind", ["mkv", "webm", "avi"])
 def test_a_copy_that_broke_off_is_told(tmp_path: Path, kind: str) -> None:
     """These formats play what is there and tell no fault: two thirds of 3.75 s here."""
-    whole = tmp_path / f"whole.{kind}"
-    with av.open(str(whole), "w") as container:
-        codec = {"mkv": "libx264", "webm": "libvpx", "avi": "mpeg4"}[kind]
-        stream = container.add_stream(codec, rate=24)
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        for frame in _pan()[1]:
-            pixels = np.ascontiguousarray((255 * frame).astype(np.uint8))
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-        container.mux(stream.encode(None))
+    whole = _encoded(tmp_path / f"whole.{kind}", _pan()[1])
     assert pick_frames(whole, 5).said(whole) == []
     cut = tmp_path / f"cut.{kind}"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
     (said,) = pick_frames(cut, 5).said(cut)
     assert said.startswith(f"cut.{kind} says that it lasts ") and "cut short" in said
+
+
+@pytest.mark.parametrize("kind", ["mp4", "mkv", "webm", "avi"])
+@pytest.mark.parametrize("rate", [Fraction(1), Fraction(1, 3)])
+def test_the_last_of_few_pictures_is_shown_for_as_long_as_it_lasts(
+    tmp_path: Path, kind: str, rate: Fraction
+) -> None:
+    """A clip with a picture every second or every third is not cut short by its last one."""
+    whole = _encoded(tmp_path / f"slow.{kind}", _pan()[1][15:27], rate=rate)
+    picked = pick_frames(whole, 3)
+    assert picked.said(whole) == [] and picked.shown == pytest.approx(12 / rate, abs=0.01)
+    if kind in ("mkv", "avi"):
+        whole.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+        assert len(pick_frames(whole, 3).said(whole)) == 1
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_last_picture_that_does_not_say_how_long_lasts_as_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: bool
+) -> None:
+    whole = _encoded(tmp_path / "slow.mp4", _pan()[1][15:27], rate=Fraction(1))
+    shown = list(frames._decoded(whole))
+    for picture in shown[0 if known else 11 :]:
+        picture.duration = 3 * picture.duration if known else 0
+    monkeypatch.setattr(frames, "_decoded", lambda path: iter(shown))
+    assert pick_frames(whole, 3).shown == pytest.approx(14 if known else 12)
 
 
 def test_an_mp4_that_broke_off_is_told_or_refused_with_the_second(
@@ -127,15 +146,21 @@ def test_an_mp4_that_broke_off_is_told_or_refused_with_the_second(
     )
 
 
-def _encoded(path: Path, frames: list[np.ndarray], shape: tuple[int, int] = (1, 1)) -> Path:
-    """A video whose pixels are shown as `shape` (width, height) says."""
+def _encoded(
+    path: Path,
+    pictures: list[np.ndarray],
+    shape: tuple[int, int] = (1, 1),
+    rate: Fraction | int = 24,
+) -> Path:
+    """A video whose pixels are shown as `shape` (width, height) says, `rate` pictures a second."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=24)
-        stream.height, stream.width = frames[0].shape[:2]
+        codec = {".webm": "libvpx", ".avi": "mpeg4"}.get(path.suffix, "libx264")
+        stream = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = pictures[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         stream.codec_context.sample_aspect_ratio = Fraction(*shape)
-        for frame in frames:
-            pixels = np.ascontiguousarray((255 * frame).astype(np.uint8))
+        for picture in pictures:
+            pixels = np.ascontiguousarray((255 * picture).astype(np.uint8))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         container.mux(stream.encode(None))
     return path
