@@ -47,11 +47,13 @@ def drop_mask_of(
 def otsu(values: np.ndarray, bins: int = 256) -> float:
     """The threshold that parts values (N,) into the two classes with the least variance within.
 
-    Otsu 1979, doi:10.1109/TSMC.1979.4310076, on a histogram. The only value when there is one.
+    Otsu 1979, doi:10.1109/TSMC.1979.4310076, on a histogram. The largest value where there is nothing to
+    part: where they are equal, or so alike that their floats do not know `bins` steps between them.
     """
     low, high = float(values.min()), float(values.max())
-    if high <= low:
-        return low
+    steps = np.linspace(low, high, bins + 1, dtype=np.result_type(low, high, values))
+    if (steps[1:] <= steps[:-1]).any():
+        return high
     counts, edges = np.histogram(values, bins=bins, range=(low, high))
     middle = 0.5 * (edges[1:] + edges[:-1])
     below = np.cumsum(counts).astype(np.float64)

@@ -8,6 +8,7 @@ from pipeline.masking.masks import (
     drop_mask_of,
     enhanced,
     lens_fixedness,
+    otsu,
     temporal_mean,
     threshold,
     without_specks,
@@ -33,6 +34,16 @@ def test_equation_5_by_hand() -> None:
     assert enhanced(maps[0], mean, 0.5).tolist() == [[True, False, False]]
     assert enhanced(maps[1], mean, 0.5).tolist() == [[True, True, False]]
     assert enhanced(maps[2], mean, 0.5).tolist() == [[True, False, False]]
+
+
+@pytest.mark.parametrize("apart", [0, 1, 40, 100_000])
+def test_values_that_are_all_but_equal_have_nothing_above(apart: int) -> None:
+    """256 steps need floats between them: of single precision some hundred apart, next to 0.1."""
+    low = np.float32(0.1)
+    values = np.array([low, low + apart * np.spacing(low), low])
+    assert values.dtype == np.float32
+    t = otsu(values)
+    assert (values <= t).all() if apart < 256 else (values > t).tolist() == [False, True, False]
 
 
 def test_the_mean_alone_forgets_what_one_view_sees() -> None:

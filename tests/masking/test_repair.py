@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import cv2
 import numpy as np
+import pytest
 
 from pipeline.masking.glass import GlassCamera, pane_before
 from pipeline.masking.loop import repair
@@ -89,6 +91,29 @@ def test_a_scene_that_is_wrong_everywhere_does_not_redraw_good_masks() -> None:
     # Where no attention was asked, the residual is all there is, and it is followed.
     alone = repair(look, wet, views, drawn, 4.0, rounds=1, use_attention=False, contrast=1.0)
     assert len(alone.rounds) == 2
+
+
+@pytest.mark.parametrize("mode", ["pane", "lens"])
+@pytest.mark.parametrize("size", [(3, 39), (24, 32)])
+def test_a_residual_that_is_the_same_everywhere_redraws_nothing(
+    mode: Literal["pane", "lens"], size: tuple[int, int]
+) -> None:
+    """But for the rounding of its floats."""
+    height, width = size
+    lens = (35.0, 35.0, width / 2, height / 2, 0.0)
+    views = [one._replace(intrinsics=lens, width=width, height=height) for one in cameras(5)]
+    pane = pane_before(np.stack([view.cam_from_world for view in views]), 1.5)
+    wet = [wetness(pane, view) for view in views]
+    drawn = [one > 0.5 for one in wet]
+    rng = np.random.default_rng(0)
+
+    def look(drop_masks: Sequence[np.ndarray], found: object) -> list[np.ndarray | None]:
+        return [rng.uniform(0.1, 0.1 + 1e-6, size).astype(np.float32) for _ in views]
+
+    done = repair(look, wet, views, drawn, 4.0, rounds=1, mode=mode, use_attention=False,
+                  gather_attention=False)  # fmt: skip
+    assert len(done.rounds) == 1 and done.rounds[0].found.mode == mode
+    assert all(np.array_equal(a, b) for a, b in zip(done.rounds[0].drop_masks, drawn, strict=True))
 
 
 def test_where_no_surface_has_witnesses_it_is_told_so() -> None:
