@@ -32,6 +32,7 @@ class Params(Section):
     space: Literal["auto", "ndc", "contract"]
     steps: Annotated[int, Field(ge=1)]
     batch_rays: Annotated[int, Field(ge=64, le=65536)]
+    shards: Annotated[int, Field(ge=1, le=64)]
     paper_steps: Annotated[int, Field(ge=1)]
     paper_batch_rays: Annotated[int, Field(ge=64, le=65536)]
     samples: Annotated[int, Field(ge=4, le=64)]
@@ -110,7 +111,7 @@ def _fit(
             rate=params.rate,
             exposure=params.exposure,
             average=0.0 if paper else params.average,
-            threads=cores(),
+            shards=params.shards, threads=cores(),
             save_every=params.save_every, save=checkpoint.save, resume=resume, progress=show,
         )  # fmt: skip
     return steps, record

@@ -38,6 +38,7 @@ class Params(Section):
     first_steps: Annotated[int, Field(ge=1)]
     steps: Annotated[int, Field(ge=1)]
     batch_rays: Annotated[int, Field(ge=64, le=65536)]
+    shards: Annotated[int, Field(ge=1, le=64)]
     quantile: Annotated[float, Field(ge=0, le=1)]
     window: Annotated[int, Field(ge=0)] | Literal["auto"]
     witnesses: Annotated[int, Field(ge=0)]
@@ -94,7 +95,8 @@ def _look(
     """The residuals of the fitted images after a further fit; None for the held-out ones."""
     drops = {i.record.name: mask for i, mask in zip(field.images, drop_masks, strict=True)}
     number = len(field.psnr)
-    field.fit(drops, params.steps if number else params.first_steps, params.batch_rays, cores())
+    steps = params.steps if number else params.first_steps
+    field.fit(drops, steps, params.batch_rays, cores(), params.shards)
 
     def looked(image: PosedImage) -> tuple[np.ndarray, np.ndarray]:
         """Depth and residual of a view. Its picture is let go: of hundreds it would fill the memory."""

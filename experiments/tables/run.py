@@ -4,7 +4,7 @@
 
 The stages are those of dvc.yaml in the profile's folder. Here they run in an order of their own, cheap rows
 and the first seed of everything first, with one process per core, each on one core. Stopped, it goes on
-where it was. After every phase the tables are written from what there is; what is missing is said in them.
+where it was. Now and then the tables are written from what there is; what is missing is said in them.
 """
 
 from __future__ import annotations
@@ -15,75 +15,121 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+from experiments.tables.warm import serving
 from pipeline.parallel import cores
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
+Process = subprocess.Popen[bytes]
 PROFILES = ("tiny", "quick", "full")
 
 
-def phases(targets: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """The targets of dvc.yaml in the order in which they should be made, as (what, targets)."""
+class Share(NamedTuple):
+    """Targets of dvc.yaml that are made one after the other on one core: a scene's part of ``what``."""
+
+    what: str
+    scene: str
+    targets: list[str]
+
+
+def shares(targets: Sequence[str]) -> list[Share]:
+    """All targets but the table, in the order in which they should be made.
+
+    What a share needs was made by earlier ones of its scene.
+    """
+    scenes = {name.split("@")[1] for name in targets if name.startswith("prepare@")}
     seeds = sorted({name.rsplit("-", 1)[1] for name in targets if name.startswith("fit@")})
+    rows: tuple[str, ...] = ("fit", "unaveraged", "loop")
+    kinds: list[tuple[str, tuple[str, ...], str]] = [("photos, masks, poses", ("prepare",), "")]
+    for number, seed in enumerate(seeds):
+        kinds.append((f"fits, seed {seed}", rows, f"-{seed}"))
+        if number == 0:
+            kinds.append(("removers", ("restore",), ""))
+            kinds.append((f"fits to cleaned photos, seed {seed}", ("cleaned",), f"-{seed}"))
+    for seed in seeds[1:]:
+        kinds.append((f"fits to cleaned photos, seed {seed}", ("cleaned",), f"-{seed}"))
 
-    def of(kinds: tuple[str, ...], end: str = "") -> list[str]:
-        return [
-            t for kind in kinds for t in targets if t.startswith(f"{kind}@") and t.endswith(end)
-        ]
+    def scene_of(target: str) -> str:
+        name = target.split("@")[1]
+        return max((s for s in scenes if f"{name}-".startswith(f"{s}-")), key=len)
 
-    restore = of(("restore",))
-    restore.sort(key=lambda name: name.endswith("-wen"))  # the dearest last
-    kinds = ("fit", "unaveraged", "loop")
-    fits = [(f"fits, seed {seed}", of(kinds, f"-{seed}")) for seed in seeds]
-    cleaned = [
-        (f"fits to cleaned photos, seed {seed}", of(("cleaned",), f"-{seed}")) for seed in seeds
-    ]
-    steps = [("photos, masks, poses", of(("prepare",))), *fits[:1], ("removers", restore)]
-    steps += [*cleaned[:1], *fits[1:], *cleaned[1:]]
-    return [step for step in steps if step[1]]
+    made = []
+    for what, some, end in kinds:
+        chosen = [t for k in some for t in targets if t.startswith(f"{k}@") and t.endswith(end)]
+        for scene in dict.fromkeys(map(scene_of, chosen)):
+            made.append(Share(what, scene, [t for t in chosen if scene_of(t) == scene]))
+    return made
 
 
 def _environment() -> dict[str, str]:
     one = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     path = os.pathsep.join(filter(None, (str(Path(sys.executable).parent), os.environ.get("PATH"))))
     # Two progress bars in one terminal are none.
-    return {**os.environ, **one, "PATH": path, "PYTHONPATH": str(ROOT), "TQDM_DISABLE": "1"}
+    return one | {"PATH": path, "PYTHONPATH": str(ROOT), "TQDM_DISABLE": "1"}
 
 
 def _dvc(*words: str) -> list[str]:
     return [sys.executable, "-m", "dvc", *words]
 
 
-def _repro(folder: Path, targets: Sequence[str]) -> bool:
-    """Makes the targets, on one core each at a time; whether all were made.
+def _next(waiting: list[Share], busy: set[str]) -> Share | None:
+    """Takes the first share whose scene nobody works on."""
+    for place, share in enumerate(waiting):
+        if share.scene not in busy:
+            return waiting.pop(place)
+    return None
 
-    Failures are told by DVC and do not stop the rest.
-    """
+
+def _start(folder: Path, share: Share, core: int, environment: dict[str, str]) -> Process:
+    """DVC making a share on one core. It tells failures itself, and goes on with the rest."""
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    running = []
-    for worker in range(min(cores(), len(targets))):
-        # They share one repository, whose lock is held while a result is written down. What a target
-        # needs was made in an earlier phase; to check it again DVC would lock it against the other worker.
-        command = _dvc("--wait-for-lock", "repro", "--single-item", "--keep-going", "--quiet")
-        command += targets[worker :: cores()]
 
-        def pinned(core: int = worker) -> None:
-            if usable:
-                os.sched_setaffinity(0, {usable[core % len(usable)]})
+    def pinned() -> None:
+        if usable:
+            os.sched_setaffinity(0, {usable[core % len(usable)]})
 
-        running.append(subprocess.Popen(command, cwd=folder, env=_environment(), preexec_fn=pinned))
-    try:
-        return not any([process.wait() for process in running])
-    finally:
-        for process in running:
-            process.terminate()
+    # Two share one repository, whose lock is held while a result is written down. What a target needs was
+    # made in an earlier share; to check it again DVC would lock it against the other worker.
+    command = _dvc("--wait-for-lock", "repro", "--single-item", "--keep-going", "--quiet")
+    return subprocess.Popen(command + share.targets, cwd=folder, env=environment, preexec_fn=pinned)
+
+
+def _make(folder: Path, waiting: list[Share], table: Callable[[str], None]) -> bool:
+    """Makes the shares, one per core at a time; whether all were made.
+
+    ``table`` is called with every kind of share when its last one is there.
+    """
+    waiting, running, made = list(waiting), dict[int, tuple[Share, Process]](), True
+    left = Counter(share.what for share in waiting)
+    with serving() as warm:
+        environment = {**os.environ, **warm}
+        try:
+            while waiting or running:
+                for core in set(range(cores())) - running.keys():
+                    share = _next(waiting, {other.scene for other, _ in running.values()})
+                    if share is not None:
+                        running[core] = share, _start(folder, share, core, environment)
+                time.sleep(0.2)
+                for core, (share, process) in list(running.items()):
+                    if process.poll() is not None:
+                        made &= process.returncode == 0
+                        del running[core]
+                        left[share.what] -= 1
+                        if not left[share.what]:
+                            table(share.what)
+        finally:
+            for _, process in running.values():
+                process.terminate()
+    return made
 
 
 def main() -> int:
-    """Runs the phases; 1 when anything could not be made, be it a row that the tables then miss."""
+    """Makes every row; 1 when anything could not be made, be it a row that the tables then miss."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=PROFILES)
@@ -91,19 +137,18 @@ def main() -> int:
     listed = subprocess.run(
         _dvc("stage", "list", "--name-only"), cwd=folder, capture_output=True, text=True, check=True
     )
-    start = time.monotonic()
-    table = [sys.executable, "-m", "stages.table", "--scene", "all"]
-    scenes = sorted({name.split("@")[1] for name in listed.stdout.split() if "prepare@" in name})
-    rendered = [f"scene@{scene}" for scene in scenes]
+    work = shares(listed.stdout.split())
+    rendered = [f"scene@{scene}" for scene in sorted({share.scene for share in work})]
     subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes", check=True)
-    made = True
-    for what, targets in phases(listed.stdout.split()):
-        print(f"[{(time.monotonic() - start) / 60:5.1f} min] {what}: {len(targets)}", flush=True)
-        made &= _repro(folder, targets)
-        subprocess.run(table, cwd=folder, env=_environment(), check=False)
-    done = subprocess.run(
-        _dvc("repro", "--quiet", "--single-item", "table"), cwd=folder, env=_environment()
-    )
+    os.environ.update(_environment())  # of all that follows, copies too
+    start = time.monotonic()
+
+    def table(what: str) -> None:
+        print(f"[{(time.monotonic() - start) / 60:5.1f} min] made: {what}", flush=True)
+        subprocess.run([sys.executable, "-m", "stages.table", "--scene", "all"], cwd=folder)
+
+    made = _make(folder, work, table)
+    done = subprocess.run(_dvc("repro", "--quiet", "--single-item", "table"), cwd=folder)
     print(f"[{(time.monotonic() - start) / 60:5.1f} min] {folder / 'tables' / 'tables.md'}")
     return 0 if made and done.returncode == 0 else 1
 

@@ -3,18 +3,39 @@
     python -m experiments.tables.steps nerf render evaluate --scene street --variant nerf-0
 
 runs them one after the other, each as `python -m stages.NAME` would, and stops at the first that fails.
+Where STEPS_ADDRESS is the address of :mod:`experiments.tables.warm`, it asks there for a process.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
+from collections.abc import Sequence
+from multiprocessing.connection import Client
+from pathlib import Path
 
-from pipeline.stage import run
+ADDRESS = "STEPS_ADDRESS"
 
 
-def main(words: list[str]) -> int:
+def main(words: Sequence[str]) -> int:
+    """Runs the stages named before the first flag, here or where they are loaded; the exit code."""
+    if ADDRESS not in os.environ:
+        return run_stages(words)
+    usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+    try:
+        with Client(os.environ[ADDRESS]) as line:
+            line.send((words, Path.cwd(), usable))
+            code: int = line.recv()
+            return code
+    except (EOFError, OSError):
+        return 1  # whoever ordered the work has ended
+
+
+def run_stages(words: Sequence[str]) -> int:
     """Runs the stages named before the first flag; the exit code of the last one that ran."""
+    from pipeline.stage import run  # only here: who asks another process need not load it
+
     first = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
     for name in words[:first]:
         stage = importlib.import_module(f"stages.{name}")

@@ -65,9 +65,17 @@ class GrowingField:
         self.psnr: list[float] = []
 
     def fit(
-        self, drop_masks: Mapping[str, np.ndarray], steps: int, batch_rays: int, threads: int
+        self,
+        drop_masks: Mapping[str, np.ndarray],
+        steps: int,
+        batch_rays: int,
+        threads: int,
+        shards: int = 2,
     ) -> None:
-        """Fits the images that are not held out, without the pixels of `drop_masks` (by name)."""
+        """Fits the images that are not held out, without the pixels of `drop_masks` (by name).
+
+        `shards` and `threads` as in :func:`pipeline.field.fit.fit`.
+        """
         images = [replace(image, keep_mask=~drop_masks[image.record.name]) for image in self.images]
         seed = self.seed + len(self.psnr)
         with tqdm(total=steps, desc="brief fit", unit="step", leave=False) as bar:
@@ -81,6 +89,7 @@ class GrowingField:
                 steps=steps,
                 batch_rays=batch_rays,
                 seed=seed,
+                shards=shards,
                 threads=threads,
                 progress=show,
             )

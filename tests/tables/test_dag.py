@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from experiments.tables import run
-from experiments.tables.run import PROFILES, phases
+from experiments.tables import run, steps, warm
+from experiments.tables.run import PROFILES, shares
 from pipeline.params import read_folders, read_params, read_section, stage_names
 from pipeline.tables.rows import ROWS
 from tests.test_architecture import true_code_dependencies
@@ -39,6 +39,7 @@ def test_code_dependencies_are_what_the_stages_import(name: str) -> None:
     assert stages <= set(stage_names())
     code = {f"stages/{stage}.py" for stage in stages}
     code |= {path for stage in stages for path in true_code_dependencies(stage)}
+    code = {"pipeline/io" if path.startswith("pipeline/io/") else path for path in code}
     listed = {dep.removeprefix(UP) for dep in DAG[name]["deps"] if dep.startswith(UP)}
     assert {path for path in listed if path.startswith(("pipeline/", "stages/"))} == code
 
@@ -92,14 +93,57 @@ def test_one_seed_of_everything_comes_before_the_next() -> None:
         "prepare@a", "restore@a-wen", "restore@a-quan", "fit@a-nerf-0", "fit@a-nerf-1",
         "loop@a-0", "loop@a-1", "cleaned@a-wen-0", "cleaned@a-wen-1", "table",
     ]  # fmt: skip
-    assert [some for _, some in phases(targets)] == [
+    assert [share.targets for share in shares(targets)] == [
         ["prepare@a"],
         ["fit@a-nerf-0", "loop@a-0"],
-        ["restore@a-quan", "restore@a-wen"],
+        ["restore@a-wen", "restore@a-quan"],
         ["cleaned@a-wen-0"],
         ["fit@a-nerf-1", "loop@a-1"],
         ["cleaned@a-wen-1"],
     ]
+
+
+def test_every_target_is_made_once_and_within_its_own_scene() -> None:
+    """Names of scenes may begin with one another: street, street-move."""
+    scenes = ["street", "street-move", "move"]
+    targets = [f"prepare@{scene}" for scene in scenes]
+    targets += [f"{kind}@{scene}-nerf-0" for scene in scenes for kind in ("fit", "cleaned")]
+    made = shares([*targets, "table"])
+    assert sorted(t for share in made for t in share.targets) == sorted(targets)
+    for share in made:
+        for target in share.targets:
+            assert target.split("@")[1] in {share.scene, f"{share.scene}-nerf-0"}
+
+
+def test_a_scene_is_worked_on_by_one_at_a_time_in_order() -> None:
+    waiting = shares(
+        ["prepare@a", "prepare@b", "prepare@c", "fit@a-nerf-0", "fit@b-nerf-0", "fit@c-nerf-0"]
+    )
+    first = run._next(waiting, set())
+    assert first is not None and first.targets == ["prepare@a"]
+    second = run._next(waiting, {"a", "c"})
+    assert second is not None and second.targets == ["prepare@b"]
+    third = run._next(waiting, {"a", "b", "c"})
+    assert third is None
+    fourth = run._next(waiting, {"a", "b"})
+    assert fourth is not None and fourth.targets == ["prepare@c"]
+    fifth = run._next(waiting, set())
+    assert fifth is not None and fifth.targets == ["fit@a-nerf-0"]
+
+
+def test_stages_run_in_a_copy_end_as_they_would_here(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The exit code is theirs; where nobody answers it is that of a failure."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(warm, "LOADED", ["pipeline.stage"])
+    (tmp_path / "params.yaml").write_text("scenes: {a: {}}\nrefine: {rounds: many}\n")
+    with warm.serving() as environment:
+        monkeypatch.setenv(steps.ADDRESS, environment[steps.ADDRESS])
+        assert steps.main([]) == 0
+        assert steps.main(["refine", "--scene", "a"]) == 2
+    assert (tmp_path / "artifacts").exists() is False
+    assert steps.main([]) == 1
 
 
 def test_a_row_that_failed_is_told_by_the_exit_code(
@@ -110,6 +154,7 @@ def test_a_row_that_failed_is_told_by_the_exit_code(
     monkeypatch.setattr(run, "_dvc", lambda *words: [sys.executable, "-c", code, *words])
     monkeypatch.setattr(run, "cores", lambda: 2)
     monkeypatch.setattr(run.signal, "signal", lambda number, how: None)
+    monkeypatch.setattr(run, "_environment", dict)
     monkeypatch.setattr(sys, "argv", ["run", "tiny"])
 
     def runs(targets: str) -> int:
