@@ -84,8 +84,7 @@ def main(job: Job, params: Params) -> str:
         write_drop_masks(fresh, names, done.rounds[-1].drop_masks)
         told = account(done, names)
         write_json(fresh / "refine.json", told)
-    count = len(done.rounds) - 1
-    rounds = "1 round" if count == 1 else f"{count} rounds"
+    rounds = "1 round" if len(done.rounds) == 2 else f"{len(done.rounds) - 1} rounds"
     return f"{rounds}, {100 * told['mean_coverage']:.1f} % masked, {told['why']}"
 
 
@@ -94,9 +93,8 @@ def _look(
 ) -> list[np.ndarray | None]:
     """The residuals of the fitted images after a further fit; None for the held-out ones."""
     drops = {i.record.name: mask for i, mask in zip(field.images, drop_masks, strict=True)}
-    number = len(field.psnr)
-    steps = params.steps if number else params.first_steps
-    field.fit(drops, steps, params.batch_rays, cores(), params.shards)
+    number, rays = len(field.psnr), params.batch_rays
+    field.fit(drops, params.steps if number else params.first_steps, rays, cores(), params.shards)
 
     def looked(image: PosedImage) -> tuple[np.ndarray, np.ndarray]:
         """Depth and residual of a view. Its picture is let go: of hundreds it would fill the memory."""

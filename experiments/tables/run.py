@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,39 +30,54 @@ PROFILES = ("tiny", "quick", "full")
 
 
 class Share(NamedTuple):
-    """Targets of dvc.yaml that are made one after the other on one core: a scene's part of ``what``."""
+    """Targets of dvc.yaml that are made one after the other on one core: a scene's part of ``what``.
+
+    Every part of ``needs`` that the scene has must be made before.
+    """
 
     what: str
     scene: str
     targets: list[str]
+    needs: tuple[str, ...] = ()
+
+
+PHOTOS, REMOVERS = "photos, masks, poses", "removers"
+
+
+class _Kind(NamedTuple):
+    what: str
+    stages: tuple[str, ...]
+    end: str = ""
+    needs: tuple[str, ...] = (PHOTOS,)
+
+
+def _kinds(seeds: Sequence[str]) -> list[_Kind]:
+    """What there is to do, the first seed of everything first."""
+    rows = ("fit", "unaveraged", "loop")
+    fits = [_Kind(f"fits, seed {seed}", rows, f"-{seed}") for seed in seeds]
+    cleaned = [
+        _Kind(f"fits to cleaned photos, seed {s}", ("cleaned",), f"-{s}", (PHOTOS, REMOVERS))
+        for s in seeds
+    ]
+    once = _Kind(PHOTOS, ("prepare",), needs=()), _Kind(REMOVERS, ("restore",))
+    return [once[0], *fits[:1], once[1], *cleaned[:1], *fits[1:], *cleaned[1:]]
 
 
 def shares(targets: Sequence[str]) -> list[Share]:
-    """All targets but the table, in the order in which they should be made.
-
-    What a share needs was made by earlier ones of its scene.
-    """
+    """All targets but the table, in the order in which they should be made."""
     scenes = {name.split("@")[1] for name in targets if name.startswith("prepare@")}
     seeds = sorted({name.rsplit("-", 1)[1] for name in targets if name.startswith("fit@")})
-    rows: tuple[str, ...] = ("fit", "unaveraged", "loop")
-    kinds: list[tuple[str, tuple[str, ...], str]] = [("photos, masks, poses", ("prepare",), "")]
-    for number, seed in enumerate(seeds):
-        kinds.append((f"fits, seed {seed}", rows, f"-{seed}"))
-        if number == 0:
-            kinds.append(("removers", ("restore",), ""))
-            kinds.append((f"fits to cleaned photos, seed {seed}", ("cleaned",), f"-{seed}"))
-    for seed in seeds[1:]:
-        kinds.append((f"fits to cleaned photos, seed {seed}", ("cleaned",), f"-{seed}"))
 
     def scene_of(target: str) -> str:
         name = target.split("@")[1]
         return max((s for s in scenes if f"{name}-".startswith(f"{s}-")), key=len)
 
     made = []
-    for what, some, end in kinds:
-        chosen = [t for k in some for t in targets if t.startswith(f"{k}@") and t.endswith(end)]
+    for what, stages, end, needs in _kinds(seeds):
+        chosen = [t for k in stages for t in targets if t.startswith(f"{k}@") and t.endswith(end)]
         for scene in dict.fromkeys(map(scene_of, chosen)):
-            made.append(Share(what, scene, [t for t in chosen if scene_of(t) == scene]))
+            mine = [t for t in chosen if scene_of(t) == scene]
+            made.append(Share(what, scene, mine, needs))
     return made
 
 
@@ -77,10 +92,11 @@ def _dvc(*words: str) -> list[str]:
     return [sys.executable, "-m", "dvc", *words]
 
 
-def _next(waiting: list[Share], busy: set[str]) -> Share | None:
-    """Takes the first share whose scene nobody works on."""
+def _next(waiting: list[Share], running: Iterable[Share]) -> Share | None:
+    """Takes the first share that has what it needs out of those waiting."""
+    ahead = {(share.scene, share.what) for share in (*waiting, *running)}
     for place, share in enumerate(waiting):
-        if share.scene not in busy:
+        if not any((share.scene, need) in ahead for need in share.needs):
             return waiting.pop(place)
     return None
 
@@ -94,7 +110,7 @@ def _start(folder: Path, share: Share, core: int, environment: dict[str, str]) -
             os.sched_setaffinity(0, {usable[core % len(usable)]})
 
     # Two share one repository, whose lock is held while a result is written down. What a target needs was
-    # made in an earlier share; to check it again DVC would lock it against the other worker.
+    # made in a share before; to check it again DVC would lock it against the other worker.
     command = _dvc("--wait-for-lock", "repro", "--single-item", "--keep-going", "--quiet")
     return subprocess.Popen(command + share.targets, cwd=folder, env=environment, preexec_fn=pinned)
 
@@ -111,7 +127,7 @@ def _make(folder: Path, waiting: list[Share], table: Callable[[str], None]) -> b
         try:
             while waiting or running:
                 for core in set(range(cores())) - running.keys():
-                    share = _next(waiting, {other.scene for other, _ in running.values()})
+                    share = _next(waiting, [one for one, _ in running.values()])
                     if share is not None:
                         running[core] = share, _start(folder, share, core, environment)
                 time.sleep(0.2)

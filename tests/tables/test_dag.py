@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from experiments.tables import run, steps, warm
-from experiments.tables.run import PROFILES, shares
+from experiments.tables.run import PROFILES, Share, shares
 from pipeline.params import read_folders, read_params, read_section, stage_names
 from pipeline.tables.rows import ROWS
 from tests.test_architecture import true_code_dependencies
@@ -115,20 +115,31 @@ def test_every_target_is_made_once_and_within_its_own_scene() -> None:
             assert target.split("@")[1] in {share.scene, f"{share.scene}-nerf-0"}
 
 
-def test_a_scene_is_worked_on_by_one_at_a_time_in_order() -> None:
-    waiting = shares(
-        ["prepare@a", "prepare@b", "prepare@c", "fit@a-nerf-0", "fit@b-nerf-0", "fit@c-nerf-0"]
-    )
-    first = run._next(waiting, set())
-    assert first is not None and first.targets == ["prepare@a"]
-    second = run._next(waiting, {"a", "c"})
-    assert second is not None and second.targets == ["prepare@b"]
-    third = run._next(waiting, {"a", "b", "c"})
-    assert third is None
-    fourth = run._next(waiting, {"a", "b"})
-    assert fourth is not None and fourth.targets == ["prepare@c"]
-    fifth = run._next(waiting, set())
-    assert fifth is not None and fifth.targets == ["fit@a-nerf-0"]
+def test_no_share_is_taken_before_what_it_needs_is_made() -> None:
+    scenes = ("a", "b")
+    targets = [f"{kind}@{scene}{row}" for scene in scenes for kind, row in (
+        ("prepare", ""), ("fit", "-nerf-0"), ("restore", "-wen"), ("cleaned", "-wen-0")
+    )]  # fmt: skip
+    waiting = shares(targets)
+
+    def taken(*running: Share) -> Share:
+        share = run._next(waiting, running)
+        assert share is not None
+        return share
+
+    first, second = taken(), taken()
+    assert [first.targets, second.targets] == [["prepare@a"], ["prepare@b"]]
+    assert run._next(waiting, [first, second]) is None
+    third = taken(first)
+    assert third.targets == ["fit@b-nerf-0"]
+    assert taken(first, third).targets == ["restore@b-wen"]
+    fourth = taken()
+    assert fourth.targets == ["fit@a-nerf-0"]
+    fifth = taken()
+    assert fifth.targets == ["restore@a-wen"]
+    assert taken(fifth).targets == ["cleaned@b-wen-0"]
+    assert run._next(waiting, [fifth]) is None
+    assert taken().targets == ["cleaned@a-wen-0"]
 
 
 def test_stages_run_in_a_copy_end_as_they_would_here(
