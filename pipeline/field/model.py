@@ -8,13 +8,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from llvmlite.binding import get_host_cpu_features
 
 from pipeline.errors import UserError
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.paper_field import PaperConfig, PaperField
 from pipeline.geometry.rays import UNDISTORT_STEPS
 from pipeline.geometry.spaces import Space, fit_space
+from pipeline.io.processor import multiplies_bfloat16
 
 # A contracted space holds all that is around the cameras: what they look at fills about a quarter of its sides,
 # and a ray finds the surface with fewer of its samples.
@@ -115,10 +115,7 @@ def half_is_fast(model: str, device: str) -> bool:
     """
     if model == "paper":
         return device != "cpu" and torch.cuda.get_device_capability(device) >= (8, 0)
-    if device != "cpu":
-        return False
-    features = get_host_cpu_features()
-    return bool(features.get("avx512bf16") or features.get("amx-bf16"))
+    return device == "cpu" and multiplies_bfloat16()
 
 
 def build(model: str, config: Mapping[str, Any], space: Space, seed: int) -> GridField | PaperField:
