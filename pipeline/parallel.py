@@ -7,6 +7,7 @@ import secrets
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +34,15 @@ def map_named(
     job_label: str,
     scheduler: str | None = None,
     workers: int | None = None,
+    counts: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """`function(*items[name])` for every name, in the order of the names.
 
     `function` lives in a module, takes paths and small values and returns small values; it runs
     single-threaded, `workers` at a time (default: one per core). With `scheduler` (tcp://host:port) the
     calls run on that Dask cluster, whose workers need the project installed and see the same folders.
-    The results do not depend on where they were computed. A failure names the item.
+    The results do not depend on where they were computed. A failure names the item. `counts`: how many
+    images an item stands for, where it is a run of them; the bar counts these.
     """
     # A cluster takes tasks of one name for one task, whoever sent them: two scenes have a frame_0000.png each.
     mine = secrets.token_hex(8)
@@ -49,8 +52,19 @@ def map_named(
         )
         for name, args in sorted(items.items())
     }
+    sizes = {task.key: (counts or {}).get(name, 1) for name, task in tasks.items()}
     compute = _on_cluster if scheduler else _on_threads
-    return compute(tasks, job_label, scheduler or "", workers or cores())
+    return compute(tasks, sizes, job_label, scheduler or "", workers or cores())
+
+
+def cut(count: int, longest: int, workers: int) -> list[range]:
+    """Runs of consecutive numbers below `count`, none longer than `longest`, so that all workers are busy.
+
+    As many as workers, or a multiple; their lengths differ by one at most.
+    """
+    runs = min(count, -(-count // (longest * workers)) * workers)
+    ends = [count * k // runs for k in range(runs + 1)]
+    return [range(first, last) for first, last in pairwise(ends)]
 
 
 def _call(label: str, name: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
@@ -69,14 +83,17 @@ def _call(label: str, name: str, function: Callable[..., Any], args: tuple[Any, 
         raise RuntimeError(f"{label} failed on {name}: {error!r}") from error
 
 
-def _on_threads(tasks: dict[str, Delayed], label: str, _: str, workers: int) -> dict[str, Any]:
+def _on_threads(
+    tasks: dict[str, Delayed], sizes: dict[str, int], label: str, _: str, workers: int
+) -> dict[str, Any]:
     torch = sys.modules.get("torch")
     threads = torch.get_num_threads() if torch is not None else 0
     try:
-        bar = tqdm(total=len(tasks), desc=label, unit="image", leave=False)
+        bar = tqdm(total=sum(sizes.values()), desc=label, unit="image", leave=False)
+        step = Callback(posttask=lambda key, *_: bar.update(sizes.get(key, 0)))
         # A pool of our own: leaving it waits for what still runs when a task fails, so that nothing
         # is written into a folder that has been given up.
-        with ThreadPoolExecutor(workers) as pool, bar, Callback(posttask=lambda *_: bar.update()):
+        with ThreadPoolExecutor(workers) as pool, bar, step:
             how = {"scheduler": "threads", "num_workers": workers, "pool": pool}
             results = dask.compute(*tasks.values(), optimize_graph=False, **how)
     finally:
@@ -85,7 +102,9 @@ def _on_threads(tasks: dict[str, Delayed], label: str, _: str, workers: int) -> 
     return dict(zip(tasks, results, strict=True))
 
 
-def _on_cluster(tasks: dict[str, Delayed], label: str, address: str, _: int) -> dict[str, Any]:
+def _on_cluster(
+    tasks: dict[str, Delayed], sizes: dict[str, int], label: str, address: str, _: int
+) -> dict[str, Any]:
     # Late: the cluster's library takes a second to load, and few runs use it.
     from distributed import Client, KilledWorker, as_completed
 
@@ -106,10 +125,10 @@ def _on_cluster(tasks: dict[str, Delayed], label: str, address: str, _: int) -> 
             ) from None
         futures = client.compute(list(tasks.values()), retries=2)
         try:
-            with tqdm(total=len(tasks), desc=label, unit="image", leave=False) as bar:
+            with tqdm(total=sum(sizes.values()), desc=label, unit="image", leave=False) as bar:
                 for future in as_completed(futures):
                     future.result()
-                    bar.update()
+                    bar.update(sizes[future.key])
         except KilledWorker as error:
             name = next(n for n, f in zip(tasks, futures, strict=True) if f is future)
             raise UserError(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
-from torch import Tensor, nn
+from torch import nn
 
 from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.errors import UserError
@@ -16,14 +16,17 @@ from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.images import read_image, write_image
 from pipeline.io.scene import read_images_json, write_images_json
 from pipeline.io.weights import fill, read_state
-from pipeline.parallel import map_named
+from pipeline.parallel import cores, cut, map_named
 from pipeline.removal.autoencoder import ContextualAutoencoder
-from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen, window_around
+from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen_run, windows_of
+from pipeline.removal.precision import in_half, keep_exact
 from pipeline.removal.quan import QuanNet, from_tensorflow
 from pipeline.removal.wen import WenNet
 from pipeline.stage import Job, Section, run
 
 Networks = tuple[nn.Module, ...]
+Which = tuple[str, Path, str, str]  # what networks_of takes
+LONGEST = 8  # photos of a run of `wen`, which looks at four more beside it
 OWN = "weights/removers/{}.safetensors"  # where train_remover writes them
 
 
@@ -38,6 +41,7 @@ class Params(Section):
         bool, Field(description="quan: two empty edge channels, as released")
     ]
     keep_clear: Annotated[bool, Field(description="wen: what its map calls clear stays the photo")]
+    precision: Literal["auto", "float32", "bfloat16"]
 
 
 def main(job: Job, params: Params) -> str:
@@ -50,47 +54,48 @@ def main(job: Job, params: Params) -> str:
             "or set restore.weights to the released ones (docs/removers.md).",
         )
     digest = hashlib.sha256(weights.read_bytes()).hexdigest() if weights.is_file() else ""
-    networks_of(params.method, weights, digest, job.device)  # what is wrong with them is told once
+    which = (params.method, weights, digest, job.device)
+    networks_of(*which)  # what is wrong with them is told once
     records = read_images_json(job.paths.images)
     names = [record.name for record in records]
+    half = in_half(params.precision, job.device)
+    photos = [job.paths.images / name for name in names]
     with publish_dir(job.paths.restored) as fresh:
-        tasks = {}
-        for index, name in enumerate(names):
-            window, place = window_around(index, len(names))
-            files = [job.paths.images / names[k] for k in window]
-            tasks[name] = (params, weights, digest, job.device, files, place, fresh / name)
-        map_named(clean_one, tasks, job_label="restore", scheduler=job.scheduler)
-        about = {"method": params.method, "weights_sha256": digest, "images": names}
-        write_json(fresh / "restored.json", about)
+        tasks, counts = {}, {}
+        for run_of in cut(len(names), LONGEST if params.method == "wen" else 1, cores()):
+            label = " to ".join(dict.fromkeys((names[run_of[0]], names[run_of[-1]])))
+            tasks[label] = (params, half, which, windows_of(photos, run_of), fresh)
+            counts[label] = len(run_of)
+        map_named(clean_run, tasks, counts=counts, job_label="restore", scheduler=job.scheduler)
+        about = {"method": params.method, "weights_sha256": digest, "bfloat16": half}
+        write_json(fresh / "restored.json", {**about, "images": names})
         write_images_json(fresh, records)  # so that a fit can take these photos instead
     return f"{len(names)} photos restored by {params.method} in {job.paths.restored}"
 
 
-def clean_one(
-    params: Params,
-    weights: Path,
-    digest: str,
-    device: str,
-    window: list[Path],
-    place: int,
-    out: Path,
+def clean_run(
+    params: Params, half: bool, which: Which, windows: list[tuple[list[Path], int]], out: Path
 ) -> None:
-    """Writes one dry photo; `window` holds the frames around it, which only `wen` looks at."""
-    networks = networks_of(params.method, weights, digest, device)
+    """Writes a run of dry photos; windows: the frames around each, for `wen`, and which of them it is."""
+    nets: Any = networks_of(*which)
+    photos = [window[place] for window, place in windows]
     if params.method == "wen":
-        frames = [read_image(path) for path in window]
-        write_image(out, clean_wen(networks[0], frames, place, keep_clear=params.keep_clear))  # type: ignore[arg-type]
-        return
-    image = read_image(window[place])
-    if params.method == "quan":
-        done = clean_quan(networks[0], image, published=params.published_edges)  # type: ignore[arg-type]
+        how = {"keep_clear": params.keep_clear, "half": half}
+        done = clean_wen_run(nets[0], windows, read_image, **how)
+    elif params.method == "quan":
+        how = {"published": params.published_edges, "half": half}
+        done = (clean_quan(nets[0], read_image(photo), **how) for photo in photos)
     else:
-        done = clean_attgan(networks[1], image, partial(_last_map, networks[0]))  # type: ignore[arg-type]
-    write_image(out, done)
-
-
-def _last_map(network: nn.Module, bgr: Tensor) -> Tensor:
-    return network(bgr)[-1]
+        attention, autoencoder = nets
+        done = (
+            clean_attgan(autoencoder, read_image(photo), lambda bgr: attention(bgr)[-1], half=half)
+            for photo in photos
+        )
+    for photo in photos:
+        try:
+            write_image(out / photo.name, next(done))
+        except RuntimeError as error:  # the run has a name of its own
+            raise RuntimeError(f"{photo.name}: {error}") from error
 
 
 @lru_cache(maxsize=1)
@@ -107,6 +112,7 @@ def networks_of(method: str, weights: Path, digest: str, device: str) -> Network
     for network in kinds[method]:
         fill(network, state, str(weights))
         network.to(device)
+        keep_exact(network, method)
     return kinds[method]
 
 

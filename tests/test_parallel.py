@@ -12,7 +12,7 @@ from distributed import LocalCluster
 from pipeline.errors import UserError
 from pipeline.io.images import image_size, write_image
 from pipeline.io.photos import convert, examine
-from pipeline.parallel import map_named
+from pipeline.parallel import cut, map_named
 
 
 def _square(number: int) -> int:
@@ -42,6 +42,19 @@ def test_results_come_in_the_order_of_the_names() -> None:
     assert list(map_named(_square, items, job_label="test").items()) == [
         ("a", 9), ("b", 16), ("x", 4), ("y", 1), ("z", 0),
     ]  # fmt: skip
+
+
+def test_runs_keep_all_workers_busy() -> None:
+    assert cut(24, 8, 2) == [range(0, 6), range(6, 12), range(12, 18), range(18, 24)]
+    assert cut(7, 8, 2) == [range(0, 3), range(3, 7)]
+    assert cut(3, 8, 16) == [range(0, 1), range(1, 2), range(2, 3)]
+    assert cut(20, 8, 1) == [range(0, 6), range(6, 13), range(13, 20)]
+
+
+def test_the_bar_counts_the_images_of_a_run(capsys: pytest.CaptureFixture[str]) -> None:
+    items = {"a": (1,), "b": (2,)}
+    map_named(_square, items, job_label="test", counts={"a": 3, "b": 4})
+    assert "0/7" in capsys.readouterr().err
 
 
 def test_work_leaves_the_calling_thread() -> None:

@@ -149,7 +149,7 @@ class WenRecipe(nn.Module):
         found = Frames(*(part.float() for part in self.network(rainy)))
         loss = wen_loss(found, rainy, clean, batch.drops, perceptual)
         if self.added.wen_mended > 0:
-            mended = mend(rainy, found)
+            mended = mend(rainy, found.full, found.clear)
             loss = loss + self.added.wen_mended * F.mse_loss(mended, clean)
         return Outcome(loss, found.full.flatten(1, 2), clean.flatten(1, 2), batch.drops[:, 0])
 
@@ -162,7 +162,9 @@ class WenRecipe(nn.Module):
     def restored(self, rainy: Tensor) -> Tensor:
         frames = rainy * 2 - 1
         found = self.network(frames)
-        full = mend(frames, found) if self.added.wen_mended > 0 else found.full
+        full = found.full
+        if self.added.wen_mended > 0:
+            full = mend(frames, full, found.clear)
         return (full[:, full.shape[1] // 2] + 1) / 2
 
 

@@ -23,13 +23,20 @@ class Frames(NamedTuple):
     clear: Tensor
 
 
-def mend(frames: Tensor, found: Frames) -> Tensor:
-    """The frames (B,T,3,H,W) where the map says that they are clear, and what was found elsewhere.
+class Features(NamedTuple):
+    """What depends on single frames alone: x (N,256,H/4,W/4); clear (N,1,H,W), 0 = drop."""
+
+    x: Tensor
+    clear: Tensor
+
+
+def mend(frames: Tensor, full: Tensor, clear: Tensor) -> Tensor:
+    """The frames (...,3,H,W) where the map says that they are clear, and what was found elsewhere.
 
     The picture that the released training compares once more for single photos, there with the true
     map; the released program gives out `full` as it is.
     """
-    return frames * found.clear + found.full * (1 - found.clear)
+    return frames * clear + full * (1 - clear)
 
 
 class _Wrapped(nn.Module):
@@ -103,26 +110,36 @@ class _PatchAttention(nn.Module):
         self.value_embedding = nn.Conv2d(WIDTH, WIDTH, 1)
         self.key_embedding = nn.Conv2d(WIDTH, WIDTH, 1)
         self.output_linear = nn.Sequential(nn.Conv2d(WIDTH, WIDTH, 3, 1, 1), nn.LeakyReLU(0.2))
+        self.softmax = nn.Softmax(dim=-1)
 
-    def forward(self, x: Tensor, groups: int) -> Tensor:
-        """x (B*T,256,h,w); the patches of the B*T / groups frames of a group attend to each other."""
-        count, _, height, width = x.shape
+    def forward(self, x: Tensor, groups: int, own: Tensor | None = None) -> Tensor:
+        """x (B*T,256,h,w); the patches of the B*T / groups frames of a group attend to each other.
+
+        own: what asks, when that is not all of x: some of its frames, as many of each group.
+        """
+        own = x if own is None else own
         share = WIDTH // len(self.patches)
-        embeddings = (self.query_embedding, self.key_embedding, self.value_embedding)
-        split = [embedding(x).split(share, 1) for embedding in embeddings]
-        heads = []
-        for patch, query, key, value in zip(self.patches, *split, strict=True):
-            q, k, v = (
-                F.unfold(part, patch, stride=patch)
-                .view(groups, count // groups, share * patch * patch, -1)
-                .transpose(2, 3)
-                .flatten(1, 2)
-                for part in (query, key, value)
+        split = [
+            embedding(frames).split(share, 1)
+            for embedding, frames in (
+                (self.query_embedding, own),
+                (self.key_embedding, x),
+                (self.value_embedding, x),
             )
-            weights = torch.softmax(q @ k.transpose(1, 2) / math.sqrt(q.shape[-1]), dim=-1)
-            out = (weights @ v).view(count, -1, share * patch * patch).transpose(1, 2)
-            heads.append(F.fold(out, (height, width), patch, stride=patch))
+        ]
+        heads = []
+        for patch, *parts in zip(self.patches, *split, strict=True):
+            q, k, v = (_tokens(part, patch, groups) for part in parts)
+            weights = self.softmax(q @ k.transpose(1, 2) / math.sqrt(q.shape[-1]))
+            out = (weights @ v).view(len(own), -1, share * patch * patch).transpose(1, 2)
+            heads.append(F.fold(out, own.shape[-2:], patch, stride=patch))
         return self.output_linear(torch.cat(heads, 1))
+
+
+def _tokens(part: Tensor, patch: int, groups: int) -> Tensor:
+    """The patches (groups, patches of all its frames, numbers of one) of frames (N,C,h,w)."""
+    unfolded = F.unfold(part, patch, stride=patch)
+    return unfolded.unflatten(0, (groups, -1)).transpose(2, 3).flatten(1, 2)
 
 
 class _FeedForward(nn.Module):
@@ -145,9 +162,11 @@ class _AttentionBlock(nn.Module):
         self.attention = _PatchAttention(patches)
         self.feed_forward = _FeedForward()
 
-    def forward(self, x: Tensor, groups: int) -> Tensor:
-        x = x + self.attention(x, groups)
-        return x + self.feed_forward(x)
+    def forward(self, x: Tensor, groups: int, own: Tensor | None = None) -> Tensor:
+        """All frames, or those of x that `own` is, after looking at x."""
+        asking = x if own is None else own
+        asking = asking + self.attention(x, groups, own)
+        return asking + self.feed_forward(asking)
 
 
 class WenNet(nn.Module):
@@ -187,16 +206,9 @@ class WenNet(nn.Module):
     def forward(self, frames: Tensor) -> Frames:
         """frames (B,T,3,H,W), red first, in [-1,1]; H and W multiples of 32."""
         batch, count, _, height, width = frames.shape
-        x = self.res_branch_1(self.main_branch(frames.flatten(0, 1)))
-        gate = self.weight_branch(x)
-        clear = self.mask_branch(gate)
-        x = x * torch.sigmoid(gate)
-        for block in self.spatial_attention:
-            x = block(x, batch * count)
-        x = self.res_branch_2(x)
-        quarter = self.side_branch_1(x)
-        for block in self.temporal_attention:
-            x = block(x, batch)
+        seen = self.features(frames.flatten(0, 1))
+        quarter = self.side_branch_1(seen.x)
+        x = self.temporal_attention[-1](self.fused(seen.x, batch), batch)
         x = self.upsample_block[0](x)
         half = self.side_branch_2(x)
         full = self.upsample_block[1:](x)
@@ -204,5 +216,27 @@ class WenNet(nn.Module):
             quarter,
             half,
             full.view(batch, count, 3, height, width),
-            clear.view(batch, count, 1, height, width),
+            seen.clear.view(batch, count, 1, height, width),
         )
+
+    def features(self, frames: Tensor) -> Features:
+        """The part of `forward` that looks at single frames (N,3,H,W)."""
+        x = self.res_branch_1(self.main_branch(frames))
+        gate = self.weight_branch(x)
+        clear = self.mask_branch(gate)
+        x = x * torch.sigmoid(gate)
+        for block in self.spatial_attention:
+            x = block(x, len(frames))
+        return Features(self.res_branch_2(x), clear)
+
+    def fused(self, x: Tensor, groups: int) -> Tensor:
+        """Features x of frames (N,256,h,w) before the last block in which those of a group meet."""
+        for block in self.temporal_attention[:-1]:
+            x = block(x, groups)
+        return x
+
+    def picture(self, fused: Tensor, place: int) -> Tensor:
+        """`Frames.full` (1,3,H,W) of one frame of a group, from what `fused` gives for all of it."""
+        x = self.temporal_attention[-1](fused, 1, fused[place : place + 1])
+        full: Tensor = self.upsample_block(x)
+        return full

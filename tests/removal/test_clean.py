@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from pipeline.io.images import read_image, write_image
+from pipeline.io.processor import multiplies_bfloat16
 from pipeline.io.scene import ImageRecord, write_images_json
 from pipeline.io.tensors import save_tensors
+from pipeline.removal import starts
 from pipeline.removal.autoencoder import ContextualAutoencoder
-from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen, window_around
+from pipeline.removal.clean import (
+    clean_attgan,
+    clean_quan,
+    clean_wen,
+    clean_wen_run,
+    window_around,
+    windows_of,
+)
+from pipeline.removal.precision import in_half, keep_exact, products
 from pipeline.removal.quan import QuanNet
 from pipeline.removal.wen import WenNet
 from stages import restore
@@ -72,6 +85,74 @@ def test_what_wens_map_calls_clear_stays_the_photo() -> None:
     assert np.array_equal(clean_wen(network, frames, 1), plain)
 
 
+def test_a_sequence_is_the_same_bytes_however_it_is_cut() -> None:
+    """Each frame's features are computed once in a run, and the pictures do not show in which."""
+    torch.manual_seed(0)
+    network = WenNet().eval()
+    frames = [photo(24, 32, seed) for seed in range(7)]
+    read: list[int] = []
+
+    def reader(index: int) -> np.ndarray:
+        read.append(index)
+        return frames[index]
+
+    def restored(*runs: range) -> list[np.ndarray]:
+        windows = [windows_of(range(7), run) for run in runs]
+        return [each for run in windows for each in clean_wen_run(network, run, reader)]
+
+    whole = restored(range(7))
+    assert read == list(range(7))
+    for runs in ([range(3), range(3, 7)], [range(k, k + 1) for k in range(7)]):
+        assert all(map(np.array_equal, restored(*runs), whole))
+    alone = clean_wen(network, frames[1:6], 2)
+    assert np.array_equal(alone, whole[3])
+
+
+@pytest.mark.parametrize("method", ["attgan", "quan", "wen"])
+def test_bfloat16_stays_within_a_level_of_float32(method: str) -> None:
+    """With starting weights, which carry the photo through, and noise on all of them."""
+    network: Any = {"attgan": ContextualAutoencoder, "quan": QuanNet, "wen": WenNet}[method]()
+    getattr(starts, f"start_{method}")(network, 0)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for weights in network.parameters():
+            weights += 1e-3 * torch.randn_like(weights)
+    network.eval()
+    keep_exact(network, method)
+    image = cv2.GaussianBlur(photo(48, 64), (0, 0), 2)
+
+    def restored(half: bool) -> np.ndarray:
+        if method == "attgan":
+            return clean_attgan(network, image, lambda bgr: bgr[:, :1], half=half)
+        if method == "quan":
+            return clean_quan(network, image, half=half)
+        return clean_wen(network, [image, image[::-1], image], 1, half=half)
+
+    exact, half = restored(False), restored(True)
+    assert exact.std() > 0.01
+    assert 0 < np.abs(half - exact).max() < 1 / 255
+
+
+def test_layers_that_would_show_and_each_softmax_compute_in_float32() -> None:
+    network = WenNet().eval()
+    keep_exact(network, "wen")
+    kinds = {}
+    for name, layer in network.named_modules():
+        layer.register_forward_hook(lambda *call, name=name: kinds.update({name: call[2].dtype}))
+    with torch.inference_mode(), products(torch.device("cpu"), True):
+        seen = network.features(torch.rand(1, 3, 32, 32))
+        network.picture(network.fused(seen.x, 1), 0)
+    found = {name for name, kind in kinds.items() if kind == torch.float32}
+    assert {"main_branch", "upsample_block.3", "temporal_attention.3.attention.softmax"} <= found
+    assert kinds["temporal_attention.3.feed_forward.conv.0"] == torch.bfloat16
+
+
+def test_a_precision_that_is_asked_for_is_taken_and_auto_is_for_processors() -> None:
+    assert in_half("bfloat16", "cpu") and not in_half("float32", "cpu")
+    assert in_half("auto", "cpu") == multiplies_bfloat16()
+    assert not in_half("auto", "cuda")
+
+
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     images = tmp_path / "artifacts/glass/images"
@@ -87,10 +168,11 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run_stage(root: Path, weights: str, method: str = "attgan") -> int:
+def run_stage(root: Path, weights: str, method: str = "attgan", precision: str = "auto") -> int:
     (root / "p").write_text(
         f"scenes: {{glass: {{}}}}\n"
-        f'restore: {{method: {method}, weights: "{weights}", published_edges: true, keep_clear: true}}\n'
+        f'restore: {{method: {method}, weights: "{weights}", published_edges: true, '
+        f"keep_clear: true, precision: {precision}}}\n"
     )
     with pytest.raises(SystemExit) as stop:
         restore.run("restore", restore.Params, restore.main)
@@ -116,6 +198,27 @@ def test_every_photo_is_restored(scene: Path) -> None:
     save_tensors(scene / "weights/removers/attgan.safetensors", whole)
     assert run_stage(scene, "") == 0  # where no weights are named: our own
     assert np.array_equal(read_image(out / "a.png"), first)
+
+
+def test_wen_restores_runs_and_names_the_photo_that_fails(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.manual_seed(0)
+    save_tensors(scene / "wen.safetensors", WenNet().state_dict())
+    out = scene / "artifacts/glass/restored"
+    found = []
+    for workers in (1, 2):
+        monkeypatch.setattr(restore, "cores", lambda workers=workers: workers)
+        assert run_stage(scene, "wen.safetensors", "wen", "float32") == 0
+        found.append([(out / name).read_bytes() for name in ("a.png", "b.png")])
+        assert json.loads((out / "restored.json").read_text())["bfloat16"] is False
+    assert found[0] == found[1]
+    assert run_stage(scene, "wen.safetensors", "wen", "bfloat16") == 0
+    assert json.loads((out / "restored.json").read_text())["bfloat16"] is True
+    monkeypatch.setattr(restore, "cores", lambda: 1)
+    (scene / "artifacts/glass/images/b.png").write_text("no photo")
+    assert run_stage(scene, "wen.safetensors", "wen") == 2
+    assert "b.png is not a readable image" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

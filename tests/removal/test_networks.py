@@ -174,3 +174,17 @@ def test_frames_attend_to_each_other_only_in_the_temporal_blocks() -> None:
         apart = layer(x, 2)
         assert torch.allclose(apart[:1], layer(x[:1], 1), atol=1e-5)
         assert not torch.allclose(layer(x, 1)[:1], apart[:1], atol=1e-3)
+
+
+def test_a_frame_asked_for_alone_comes_out_as_with_all_others() -> None:
+    torch.manual_seed(2)
+    network = WenNet().eval()
+    frames = torch.rand(1, 3, 3, 32, 64) * 2 - 1
+    with torch.inference_mode():
+        whole = network(frames)
+        seen = [network.features(frame) for frame in frames[0].split(1)]
+        fused = network.fused(torch.cat([each.x for each in seen]), 1)
+        for place, each in enumerate(seen):
+            assert torch.allclose(each.clear, whole.clear[0, place], atol=1e-5)
+            picture = network.picture(fused, place)[0]
+            assert torch.allclose(picture, whole.full[0, place], atol=1e-5)

@@ -142,7 +142,7 @@ def test_what_is_added_to_the_published_losses_is_added() -> None:
 
     frames, full = torch.zeros(1, 1, 3, 2, 2), torch.ones(1, 1, 3, 2, 2)
     clear = torch.tensor([[1.0, 0.0], [0.25, 0.5]]).view(1, 1, 1, 2, 2)
-    mended = mend(frames, Frames(full[0], full[0], full, clear))
+    mended = mend(frames, full, clear)
     assert mended[0, 0, 0].tolist() == [[0, 1], [0.75, 0.5]]
 
 
