@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from pipeline.tables.rows import ROWS, Row
 
 Run = tuple[str, str, int]  # scene, row's key, seed
 LOCK = "dvc.lock"
+PAUSE, PATIENCE = 0.5, 60  # seconds between two looks at the lock file, and how many looks
 
 
 def noted(tables: Iterable[Table], root: Path, runs: Mapping[Run, Path]) -> list[Table]:
@@ -40,7 +42,7 @@ def read_recorded(lock: Path) -> dict[str, dict[str, Any]]:
     if not lock.is_file():
         return {}
     try:
-        stages = YAML(typ="safe").load(lock.read_text(encoding="utf-8"))["stages"]
+        stages = YAML(typ="safe").load(_settled(lock))["stages"]
         return {
             out["path"]: _made_from(entry)
             for entry in stages.values()
@@ -51,6 +53,18 @@ def read_recorded(lock: Path) -> dict[str, dict[str, Any]]:
             f"{lock} is not a lock file of DVC ({type(error).__name__}).",
             "Restore it, or remove it: DVC then makes everything anew.",
         ) from None
+
+
+def _settled(lock: Path) -> str:
+    """The text of the lock file once nobody writes it: DVC does so in place, for a second or more, and
+    other rows may be made while the tables are. After PATIENCE looks the text as it is."""
+    text = lock.read_text(encoding="utf-8")
+    for _ in range(PATIENCE):
+        time.sleep(PAUSE)
+        before, text = text, lock.read_text(encoding="utf-8")
+        if text and text == before:
+            break
+    return text
 
 
 def _made_from(entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pipeline.io.paths import ScenePaths
 from pipeline.io.scene import read_images_json
 from pipeline.io.transforms import read_transforms
 from pipeline.stage import Job
+from pipeline.tables import settings
 from pipeline.tables.settings import read_recorded, unlike
 from stages import evaluate, shrink, table
 from tests.evaluation.fabricated import fabricate
@@ -167,6 +168,21 @@ def test_what_dvc_itself_writes_is_read(tmp_path: Path) -> None:
     made = read_recorded(lock)["data/street"]
     assert "synthesize of params.yaml" in made and made["../../pipeline/drops"].endswith(".dir")
     assert read_recorded(tmp_path / "none.lock") == {}
+
+
+def test_a_lock_file_that_dvc_is_writing_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """DVC empties it, thinks, and writes it anew from the top while other rows are made."""
+    _locked(tmp_path, {"nerf-0": 800, "nerf-1": 800}, {})
+    lock = tmp_path / "dvc.lock"
+    whole = lock.read_text()
+    states = ["", "", whole[: len(whole) // 2], whole, whole]
+    lock.write_text("")
+    monkeypatch.setattr(settings.time, "sleep", lambda seconds: lock.write_text(states.pop(0)))
+    made = read_recorded(lock)
+    assert made["artifacts/made/nerf-1/metrics.json"]["nerf of params.yaml"]["steps"] == 800
+    assert states == []
 
 
 @pytest.mark.parametrize("text", ["stages: [1]", "stages: {a: {outs: [{}]}}", "a: [", "7"])
