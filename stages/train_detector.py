@@ -69,9 +69,9 @@ def main(job: Job, params: Params) -> str:
     others = load_others({job.resolve(p): s for p, s in params.average.items()}, params.model)
     named = filter(None, (params.start, params.photos, *params.rendered, *params.photo_pairs,
                           params.validation_photos, *params.validation_rendered))  # fmt: skip
-    key = training_key(params.model_dump(exclude={"weights", "average"}), *map(job.resolve, named))
-    checkpoint = job.paths.work("train_detector") / f"{key}.pt"
-    rows = load_checkpoint(checkpoint, trainer)
+    about = params.model_dump(exclude={"weights", "average"})
+    key = training_key(about, map(job.resolve, named), "attention", "drops")
+    rows = load_checkpoint(checkpoint := job.paths.work("train_detector") / f"{key}.pt", trainer)
     with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:
 
         def on_score(done: int, steps: int, loss: float, found: dict[str, Score]) -> None:

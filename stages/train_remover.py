@@ -66,7 +66,7 @@ def main(chosen: dict[str, Method], job: Job, params: Params) -> str:
     told = params.model_dump(exclude={"folder", "attgan", "quan", "wen"} - {method})
     named = filter(None, (params.attention, params.perceptual, params.photos, *params.rendered,
                           *params.photo_pairs, params.validation_photos))  # fmt: skip
-    key = checkpoints.training_key(told, *map(job.resolve, named))
+    key = checkpoints.training_key(told, map(job.resolve, named), "attention", "drops", "removal")
     checkpoint = (work := job.paths.work("train_remover")) / f"{method}-{key}.pt"
     rows = checkpoints.load_checkpoint(checkpoint, trainer)
     with tqdm(total=trainer.total, initial=trainer.done, unit="step") as bar:

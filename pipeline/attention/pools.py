@@ -45,7 +45,8 @@ def paint_chunk(
 
 def painted_name(seed: int, photos: Sequence[Path], kind: Kind = "drops") -> str:
     """A name for pictures painted from this seed and these photos, whatever folder they lie in."""
-    return stills.painted_name("painted" if kind == "drops" else kind, seed, photos)
+    name = "painted" if kind == "drops" else kind
+    return stills.painted_name(name, seed, photos, "attention/pools.py")
 
 
 def painted_chunks(

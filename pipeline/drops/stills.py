@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.io.code import code_key
 from pipeline.io.images import read_photo, shrink
 
 LONGEST = 1200
@@ -20,9 +21,12 @@ def still(path: Path) -> np.ndarray:
     return shrink(read_photo(path)[0], LONGEST)
 
 
-def painted_name(kind: str, seed: int, photos: Sequence[Path]) -> str:
-    """A name for what was painted from this seed and these photos, whatever folder they lie in."""
-    digest = hashlib.sha256(str(seed).encode())
+def painted_name(kind: str, seed: int, photos: Sequence[Path], painter: str) -> str:
+    """A name for what is painted from this seed and these photos, whatever folder they lie in.
+
+    painter: the file of `pipeline/` that paints; other code there or in this room gives another name.
+    """
+    digest = hashlib.sha256(f"{seed} {code_key('drops', painter)}".encode())
     for photo in photos:
         digest.update(photo.read_bytes())
     return f"{kind}-{digest.hexdigest()[:12]}"

@@ -6,13 +6,14 @@ import hashlib
 import io
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
 from pipeline.io.atomic import write_bytes
+from pipeline.io.code import code_key
 
 Rows = list[list[float | str]]
 log = logging.getLogger(__name__)
@@ -26,13 +27,14 @@ class Resumable(Protocol):
     def restore(self, state: dict[str, Any]) -> None: ...
 
 
-def training_key(told: Mapping[str, Any], *sources: Path) -> str:
-    """A name for one training: its parameters, and the bytes of what it starts and learns from.
+def training_key(told: Mapping[str, Any], sources: Iterable[Path], *code: str) -> str:
+    """A name for one training: its parameters, the bytes of what it starts and learns from, and its code.
 
     sources: files, and folders of which every file counts under its name; what is not there counts as
-    nothing, since who needs it says so.
+    nothing, since who needs it says so. code: rooms of `pipeline/`.
     """
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    digest.update(code_key(*code).encode())
     for source in sources:
         if source.is_file():
             digest.update(source.read_bytes())

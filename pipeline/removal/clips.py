@@ -96,7 +96,7 @@ def read_chunk(path: Path) -> tuple[list[np.ndarray], list[np.ndarray], list[np.
 
 def painted_name(seed: int, photos: Sequence[Path]) -> str:
     """A name for clips painted from this seed and these photos, whatever folder they lie in."""
-    return stills.painted_name("clips", seed, photos)
+    return stills.painted_name("clips", seed, photos, "removal/clips.py")
 
 
 def painted_chunks(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,17 @@ def test_names_depend_on_seed_and_content_and_on_no_folder(tmp_path: Path) -> No
         write_image(tmp_path / name, grey)
     write_image(tmp_path / "two/c.png", grey + 1)
     first, same, other = (tmp_path / name for name in ("one/a.png", "two/b.png", "two/c.png"))
-    assert stills.painted_name("clips", 3, [first]) == stills.painted_name("clips", 3, [same])
+    named = partial(stills.painted_name, painter="removal/clips.py")
+    assert named("clips", 3, [first]) == named("clips", 3, [same])
     names = {
-        stills.painted_name("clips", 3, [first]),
-        stills.painted_name("clips", 4, [first]),
-        stills.painted_name("clips", 3, [other]),
-        stills.painted_name("clips", 3, []),
-        stills.painted_name("painted", 3, [first]),
+        named("clips", 3, [first]),
+        named("clips", 4, [first]),
+        named("clips", 3, [other]),
+        named("clips", 3, []),
+        named("painted", 3, [first]),
+        named("clips", 3, [first], painter="attention/pools.py"),
     }
-    assert len(names) == 5
+    assert len(names) == 6
     assert all(name.startswith(("clips-", "painted-")) for name in names)
 
 

@@ -15,13 +15,13 @@ def test_a_training_is_named_by_what_it_starts_and_learns_from(tmp_path: Path) -
     (pictures / "rainy/0.png").write_bytes(b"a")
     (pictures / "rainy/1.png").write_bytes(b"b")
 
-    def key(**told: int) -> str:
-        return training_key({"seed": 0} | told, weights, pictures)
+    def key(code: str = "drops", **told: int) -> str:
+        return training_key({"seed": 0} | told, [weights, pictures], code)
 
     first = key()
     pictures = pictures.rename(tmp_path / "elsewhere")
     assert key() == first != key(seed=1)
-    seen = {first}
+    seen = {first, key(code="attention")}
     (pictures / "rainy/1.png").write_bytes(b"c")
     seen.add(key())
     (pictures / "rainy/1.png").rename(pictures / "rainy/2.png")
@@ -30,7 +30,7 @@ def test_a_training_is_named_by_what_it_starts_and_learns_from(tmp_path: Path) -
     seen.add(key())
     weights.unlink()
     seen.add(key())
-    assert len(seen) == 5
+    assert len(seen) == 6
 
 
 class _Counter:
