@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
+from pipeline.geometry.compiled import compiled as machine_code
 from pipeline.geometry.spaces import EPS
 
 # Reordering sums lets them run in vectors; infinities and NaN must survive, or a broken fit goes unseen.
@@ -19,12 +19,8 @@ _FLAGS = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def compiled(function: Any, inline: str = "never") -> Any:
-    """The function as machine code, made at its first call and kept on disk where that is allowed."""
-    how = {"nogil": True, "fastmath": _FLAGS, "error_model": "numpy", "inline": inline}
-    try:
-        return numba.njit(cache=True, **how)(function)
-    except RuntimeError:  # neither the project's folder nor the user's cache can be written
-        return numba.njit(**how)(function)
+    """As :func:`pipeline.geometry.compiled.compiled`, with sums in any order."""
+    return machine_code(function, fastmath=_FLAGS, inline=inline)
 
 
 def inlined(function: Any) -> Any:

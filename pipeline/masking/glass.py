@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from pipeline.geometry.compiled import compiled
 from pipeline.geometry.poses import invert
 from pipeline.geometry.rays import pixel_rays
 from pipeline.geometry.spaces import mean_camera
@@ -116,20 +117,12 @@ class PaneGlass:
         """See :class:`Glass`."""
         camera = self.cameras[view]
         fx, fy, cx, cy, k1 = camera.intrinsics
-        across = (self.low[0] + (np.arange(self.shape[1]) + 0.5) * self.cell)[None, :]
-        down = (self.low[1] + (np.arange(self.shape[0]) + 0.5) * self.cell)[:, None]
-        across, down = across.astype(np.float32), down.astype(np.float32)
-        x, y, z, front = (
-            np.float32(row[0]) * across + (np.float32(row[1]) * down + np.float32(row[2]))
-            for row in (*self.view_from_glass(view), self.normal)
-        )
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            x, y = x / z, y / z
-            # Far outside its frame a lens with k1 < 0 folds points back into it.
-            framed = (np.abs(x) * fx < camera.width) & (np.abs(y) * fy < camera.height)
-            gain = 1.0 + k1 * (x * x + y * y)
-            x, y = fx * x * gain + (cx - 0.5), fy * y * gain + (cy - 0.5)
-        x[~((z > 0) & (front > 0) & framed)] = -1e6
+        across = (self.low[0] + (np.arange(self.shape[1]) + 0.5) * self.cell).astype(np.float32)
+        down = (self.low[1] + (np.arange(self.shape[0]) + 0.5) * self.cell).astype(np.float32)
+        matrix = np.vstack([self.view_from_glass(view), self.normal]).astype(np.float32)
+        lens = np.array([fx, fy, cx - 0.5, cy - 0.5, k1], np.float32)
+        x, y = np.empty((2, *self.shape), np.float32)
+        _places(across, down, matrix, lens, camera.width, camera.height, x, y)
         return _sample(values, x, y)
 
     def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
@@ -239,10 +232,43 @@ def _directions(
     return pixel_rays(u, v, numbers, torch.eye(4, dtype=torch.float64)[:3])[1].numpy()
 
 
+@compiled
+def _places(across, down, matrix, lens, width, height, x, y):  # type: ignore[no-untyped-def]
+    """Fills ``x`` and ``y`` (R, C) with the pixels at which a view shows the cells.
+
+    ``across`` (C,) and ``down`` (R,) are cells as the mean camera sees them; ``matrix`` (4, 3) leads from there
+    to the view, its last row to the mean camera's depth; ``lens``: fx, fy, cx - 0.5, cy - 0.5, k1; float32.
+    A cell that the view does not look at lies far off.
+    """
+    fx, fy, cx, cy, k1 = lens
+    one, nowhere = np.float32(1.0), np.float32(-1e6)
+    for row in range(down.size):
+        for column in range(across.size):
+            u, v = across[column], down[row]
+            z = matrix[2, 0] * u + (matrix[2, 1] * v + matrix[2, 2])
+            front = matrix[3, 0] * u + (matrix[3, 1] * v + matrix[3, 2])
+            s = (matrix[0, 0] * u + (matrix[0, 1] * v + matrix[0, 2])) / z
+            t = (matrix[1, 0] * u + (matrix[1, 1] * v + matrix[1, 2])) / z
+            gain = one + k1 * (s * s + t * t)
+            # Far outside its frame a lens with k1 < 0 folds points back into it.
+            framed = abs(s) * fx < width and abs(t) * fy < height
+            x[row, column] = fx * s * gain + cx if z > 0 and front > 0 and framed else nowhere
+            y[row, column] = fy * t * gain + cy
+
+
 def _sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """`values` between its pixels at column and row indices x, y (float32); NaN outside its frame."""
     pixels = np.asarray(values, np.float32)
     found = cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    height, width = values.shape
-    found[~((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))] = np.nan
+    _blank_beside(x, y, np.float32(pixels.shape[1] - 0.5), np.float32(pixels.shape[0] - 0.5), found)
     return found
+
+
+@compiled
+def _blank_beside(x, y, right, bottom, found):  # type: ignore[no-untyped-def]
+    """NaN in ``found`` where ``x``, ``y`` lie beyond -0.5 and ``right`` or ``bottom``, or are NaN."""
+    for row in range(found.shape[0]):
+        for column in range(found.shape[1]):
+            u, v = x[row, column], y[row, column]
+            if not (u >= -0.5 and u <= right and v >= -0.5 and v <= bottom):
+                found[row, column] = np.nan
