@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import re
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Client
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -153,6 +155,10 @@ def test_stages_run_in_a_copy_end_as_they_would_here(
         monkeypatch.setenv(steps.ADDRESS, environment[steps.ADDRESS])
         assert steps.main([]) == 0
         assert steps.main(["refine", "--scene", "a"]) == 2
+        with Client(environment[steps.ADDRESS]):
+            pass  # one that asks for nothing keeps nobody out
+        with ThreadPoolExecutor(4) as several:
+            assert set(several.map(steps.main, [[]] * 40)) == {0}
     assert (tmp_path / "artifacts").exists() is False
     assert steps.main([]) == 1
 
