@@ -29,8 +29,9 @@ def build_database(
 ) -> Matching:
     """Writes a new database with cameras, features and verified matches; returns their counts.
 
-    Images are entered in name order before any feature is computed and RANSAC is seeded, so that
-    the content does not depend on `threads`. UserError when an image cannot be read.
+    Images are entered in name order before any feature is computed, RANSAC is seeded, and features are
+    matched on one thread, so that the content does not depend on `threads`. UserError when an image
+    cannot be read.
     """
     path.unlink(missing_ok=True)
     pycolmap.set_random_seed(seed)
@@ -41,7 +42,7 @@ def build_database(
     _enter_images(path, image_dir, sizes, settings, reader)
     _set_focal_lengths(path, sizes, focal_px)
     _extract(path, image_dir, sorted(sizes), settings, reader, threads, progress)
-    _match(path, settings, seed, threads, progress)
+    _match(path, settings, seed, progress)
     return read_matching(path)
 
 
@@ -116,8 +117,9 @@ def _extract(
     progress("features", len(names), len(names))
 
 
-def _match(path: Path, settings: Settings, seed: int, threads: int, progress: Progress) -> None:
-    options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+def _match(path: Path, settings: Settings, seed: int, progress: Progress) -> None:
+    # On one thread: two of pycolmap 4.2's matchers at once find other matches in some of ten runs.
+    options = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
     options.sift.max_ratio = settings.max_ratio
     verification = pycolmap.TwoViewGeometryOptions(filter_stationary_matches=settings.still)
     verification.ransac.random_seed = seed
@@ -131,7 +133,7 @@ def _match(path: Path, settings: Settings, seed: int, threads: int, progress: Pr
         )
     else:
         pairing = pycolmap.SequentialPairingOptions(
-            overlap=SEQUENCE_OVERLAP, loop_detection=False, num_threads=threads
+            overlap=SEQUENCE_OVERLAP, loop_detection=False, num_threads=1
         )
         pycolmap.match_sequential(
             path,

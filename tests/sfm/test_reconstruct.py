@@ -87,6 +87,22 @@ def test_three_runs_write_the_same_bytes_whatever_the_threads(scene, found, tmp_
     }
 
 
+@pytest.mark.parametrize("matcher", ["exhaustive", "sequential"])
+def test_features_are_matched_on_one_thread(scene, tmp_path, monkeypatch, matcher):
+    """With more, pycolmap's matches differ in some of ten runs: too few for a test that looks at them."""
+    used = []
+    match = getattr(pycolmap, f"match_{matcher}")
+
+    def watched(*words, matching_options, **more):
+        used.append(matching_options.num_threads)
+        return match(*words, matching_options=matching_options, **more)
+
+    monkeypatch.setattr(pycolmap, f"match_{matcher}", watched)
+    settings = dataclasses.replace(SETTINGS, matcher=matcher)
+    solve(scene.images, scene.names, tmp_path, settings=settings, threads=2)
+    assert used and set(used) == {1}
+
+
 def test_the_solver_gives_back_exact_cameras_within_a_hundredth_of_a_degree(tmp_path):
     path = tmp_path / "database.db"
     options = pycolmap.SyntheticDatasetOptions(
