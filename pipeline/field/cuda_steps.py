@@ -50,7 +50,7 @@ class CudaSteps:
         self.schedule = torch.tensor(rates, device=device)
         self.rates = self.schedule[0].clone()
         for stepper, rate in zip(steppers, self.rates, strict=True):
-            stepper.adam.param_groups[0]["lr"] = rate
+            stepper.now = rate
         self.source = torch.Generator(device)
         self.stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self.taken: Counter[Hashable] = Counter()
@@ -93,8 +93,6 @@ class CudaSteps:
         graph = torch.cuda.CUDAGraph()
         graph.register_generator_state(self.source)
         pool = next((one.pool() for one, _ in self.recorded.values()), None)
-        for stepper in self.steppers:
-            stepper.adam.param_groups[0]["capturable"] = True
         try:
             with torch.cuda.graph(graph, pool, self.stream, capture_error_mode="thread_local"):
                 losses = self._work(step)
@@ -102,7 +100,5 @@ class CudaSteps:
             log.warning("The GPU records no step, so each takes longer: %s", error)
             self.record, self.source = False, torch.Generator(self.buffer.device)
             self.source.manual_seed((self.seed * 1_000_003 + step) * 64)
-            for stepper in self.steppers:
-                stepper.adam.param_groups[0]["capturable"] = False
             return
         self.recorded[phase] = graph, losses

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adamw import adamw
 
 from pipeline.field.base import Field, Part, TableGradient
 from pipeline.field.buffer import Batch
@@ -31,23 +32,29 @@ class Exposure(nn.Module):
         return [Part("log_gain", ("log_gain",), 1e-2, 0.1, warmup=50)]
 
 
+class Moments(NamedTuple):
+    """What Adam knows of a parameter: the running means of its gradient and of its square, and its steps."""
+
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    step: Tensor
+
+
 class Stepper:
-    """Adam for one part of a field, at a rate that depends on the step alone."""
+    """AdamW (arXiv:1711.05101) for one part of a field, at a rate that depends on the step alone.
+
+    torch's own steps, without ``torch.optim.AdamW`` around them, which loads torch's compiler: one to two
+    seconds at the start of every fit.
+    """
 
     def __init__(
         self, part: Part, parameters: list[nn.Parameter], steps: int, rate: float = 1.0
     ) -> None:
         self.part, self.parameters, self.steps = part, parameters, steps
         self.rate = part.rate * rate
+        self.now: float | Tensor = self.rate
         self.rooms: dict[str, Tensor] = {}
-        self.adam = torch.optim.AdamW(
-            parameters,
-            lr=self.rate,
-            betas=part.betas,
-            eps=part.eps,
-            weight_decay=part.decay,
-            fused=True,
-        )
+        self.moments: dict[str, Moments] = {}
 
     def rate_at(self, step: int) -> float:
         """The rate of a step."""
@@ -55,19 +62,38 @@ class Stepper:
         return rate * min(1.0, (step + 1) / self.part.warmup) if self.part.warmup else rate
 
     def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
-        """One step with the given gradients; none at all leaves the part as it is."""
-        self.adam.param_groups[0]["lr"] = self.rate_at(step)
+        """One step with the given gradients; what has none stays as it is."""
+        self.now = self.rate_at(step)
         self.apply(gradients)
 
+    @torch.no_grad()
     def apply(self, gradients: Sequence[Tensor | None]) -> None:
         """As :meth:`step`, at the rate that was set last."""
-        if all(gradient is None for gradient in gradients):
+        named = zip(self.part.parameters, self.parameters, gradients, strict=True)
+        moved = [(name, one, gradient) for name, one, gradient in named if gradient is not None]
+        if not moved:
             return
-        for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            parameter.grad = gradient
-        self.adam.step()
-        for parameter in self.parameters:
-            parameter.grad = None
+        for name, parameter, _ in moved:
+            if name not in self.moments:
+                self.moments[name] = _at_rest(parameter)
+        exp_avgs, exp_avg_sqs, steps = zip(*(self.moments[name] for name, *_ in moved), strict=True)
+        beta1, beta2 = self.part.betas
+        adamw(
+            [parameter for _, parameter, _ in moved],
+            [gradient for *_, gradient in moved],
+            list(exp_avgs),
+            list(exp_avg_sqs),
+            [],
+            list(steps),
+            fused=True,
+            amsgrad=False,
+            maximize=False,
+            beta1=beta1,
+            beta2=beta2,
+            lr=self.now,
+            weight_decay=self.part.decay,
+            eps=self.part.eps,
+        )
 
     def room(self, name: str) -> Tensor:
         """Zeros of a parameter's shape to add its gradient up in, the same memory in every step."""
@@ -78,18 +104,25 @@ class Stepper:
 
     def state(self) -> dict[str, Tensor]:
         """Adam's running moments by name; what :meth:`restore` takes back."""
-        out = {}
-        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
-            for key, value in self.adam.state[parameter].items():
-                out[f"{key}:{name}"] = value
-        return out
+        return {
+            f"{key}:{name}": value
+            for name, moments in self.moments.items()
+            for key, value in moments._asdict().items()
+        }
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Continue from :meth:`state`."""
-        for name, parameter in zip(self.part.parameters, self.parameters, strict=True):
-            for key in ("step", "exp_avg", "exp_avg_sq"):
-                if f"{key}:{name}" in state:
-                    self.adam.state[parameter][key] = state[f"{key}:{name}"].clone()
+        self.moments = {
+            name: Moments(*(state[f"{key}:{name}"].clone() for key in Moments._fields))
+            for name in self.part.parameters
+            if f"step:{name}" in state
+        }
+
+
+def _at_rest(parameter: nn.Parameter) -> Moments:
+    """The moments before the first step."""
+    still = torch.zeros((), device=parameter.device)
+    return Moments(torch.zeros_like(parameter), torch.zeros_like(parameter), still)
 
 
 class Average:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -232,6 +233,37 @@ def test_products_are_of_the_precision_asked_for(
     assert model.config.half is half
     record = fit(model, RayBuffer(photos, 0), steps=30, batch_rays=256, seed=0, log_every=10)
     assert record.rows[-1][2] > record.rows[0][2] + 0.5
+
+
+def test_steps_are_those_of_adamw() -> None:
+    """With decay, and for a parameter that has no gradient in some steps."""
+    start = [torch.randn(7, 3, generator=torch.Generator().manual_seed(i)) for i in range(2)]
+    ours, theirs = ([torch.nn.Parameter(one.clone()) for one in start] for _ in range(2))
+    part = Part("both", ("a", "b"), 1e-2, 0.1, (0.8, 0.95), 1e-9, warmup=2, decay=0.3)
+    stepper = Stepper(part, ours, steps=6)
+    adam = torch.optim.AdamW(theirs, betas=part.betas, eps=part.eps, weight_decay=part.decay)
+    for step in range(6):
+        a, b = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(9 + step))
+        gradients = [a, None if step == 2 else b]
+        stepper.step(step, gradients)
+        adam.param_groups[0]["lr"] = stepper.rate_at(step)
+        for parameter, gradient in zip(theirs, gradients, strict=True):
+            parameter.grad = gradient
+        adam.step()
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_a_fit_does_not_load_the_compiler_of_torch() -> None:
+    """That takes a second or two at the start of every fit, and nothing compiles."""
+    code = (
+        "import sys, torch; from pipeline.field.base import Part; "
+        "from pipeline.field.steppers import Stepper; "
+        "one = torch.nn.Parameter(torch.ones(2)); "
+        "Stepper(Part('a', ('a',), 1e-2, 0.1), [one], 1).step(0, [torch.ones(2)]); "
+        "assert one[0] < 1 and 'torch._dynamo' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
 def test_half_precision_is_for_where_products_are_what_takes_time() -> None:
