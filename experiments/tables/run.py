@@ -2,9 +2,9 @@
 
     python -m experiments.tables.run quick        # or tiny, full
 
-The stages are those of dvc.yaml in the profile's folder. Here they run in an order of their own, cheap rows
-and the first seed of everything first, with one process per core, each on one core. Stopped, it goes on
-where it was. Now and then the tables are written from what there is; what is missing is said in them.
+The stages are those of every scene's dvc.yaml in the profile's folder. Here they run in an order of their own,
+cheap rows and the first seed of everything first, with one process per core, each on one core. Stopped, it goes
+on where it was. Now and then the tables are written from what there is; what is missing is said in them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PROFILES = ("tiny", "quick", "full")
 
 
 class Share(NamedTuple):
-    """Targets of dvc.yaml that are made one after the other on one core: a scene's part of ``what``.
+    """Targets of a scene that are made one after the other on one core: its part of ``what``.
 
     Every part of ``needs`` that the scene has must be made before.
     """
@@ -41,43 +41,58 @@ class Share(NamedTuple):
     needs: tuple[str, ...] = ()
 
 
+class Target(NamedTuple):
+    """A stage as DVC names it, "street/dvc.yaml:fit@nerf-0": the scene's, of a stage, of a row and seed."""
+
+    name: str
+    scene: str
+    stage: str
+    seed: str
+
+
 PHOTOS, REMOVERS = "photos, masks, poses", "removers"
+SEEDED = ("fit", "loop", "cleaned")  # stages that are made once per seed
 
 
 class _Kind(NamedTuple):
     what: str
     stages: tuple[str, ...]
-    end: str = ""
+    seed: str = ""
     needs: tuple[str, ...] = (PHOTOS,)
+
+
+def _target(name: str) -> Target:
+    folder, _, rest = name.partition("/dvc.yaml:")
+    stage, _, row = rest.partition("@")
+    return Target(name, folder, stage, row.rpartition("-")[2] if stage in SEEDED else "")
 
 
 def _kinds(seeds: Sequence[str]) -> list[_Kind]:
     """What there is to do, the first seed of everything first."""
-    rows = ("fit", "unaveraged", "loop")
-    fits = [_Kind(f"fits, seed {seed}", rows, f"-{seed}") for seed in seeds]
+    fits = [_Kind(f"fits, seed {seed}", ("fit", "loop"), seed) for seed in seeds]
     cleaned = [
-        _Kind(f"fits to cleaned photos, seed {s}", ("cleaned",), f"-{s}", (PHOTOS, REMOVERS))
-        for s in seeds
+        _Kind(f"fits to cleaned photos, seed {seed}", ("cleaned",), seed, (PHOTOS, REMOVERS))
+        for seed in seeds
     ]
     once = _Kind(PHOTOS, ("prepare",), needs=()), _Kind(REMOVERS, ("restore",))
     return [once[0], *fits[:1], once[1], *cleaned[:1], *fits[1:], *cleaned[1:]]
 
 
-def shares(targets: Sequence[str]) -> list[Share]:
+def shares(names: Sequence[str]) -> list[Share]:
     """All targets but the table, in the order in which they should be made."""
-    scenes = {name.split("@")[1] for name in targets if name.startswith("prepare@")}
-    seeds = sorted({name.rsplit("-", 1)[1] for name in targets if name.startswith("fit@")})
-
-    def scene_of(target: str) -> str:
-        name = target.split("@")[1]
-        return max((s for s in scenes if f"{name}-".startswith(f"{s}-")), key=len)
-
+    targets = [_target(name) for name in names if "/" in name]
+    seeds = sorted({target.seed for target in targets} - {""})
     made = []
-    for what, stages, end, needs in _kinds(seeds):
-        chosen = [t for k in stages for t in targets if t.startswith(f"{k}@") and t.endswith(end)]
-        for scene in dict.fromkeys(map(scene_of, chosen)):
-            mine = [t for t in chosen if scene_of(t) == scene]
-            made.append(Share(what, scene, mine, needs))
+    for what, stages, seed, needs in _kinds(seeds):
+        for scene in sorted({target.scene for target in targets}):
+            chosen = [
+                target.name
+                for stage in stages
+                for target in targets
+                if (target.scene, target.stage, target.seed) == (scene, stage, seed)
+            ]
+            if chosen:
+                made.append(Share(what, scene, chosen, needs))
     return made
 
 
@@ -151,19 +166,30 @@ def main() -> int:
     parser.add_argument("profile", choices=PROFILES)
     folder = HERE / parser.parse_args().profile
     listed = subprocess.run(
-        _dvc("stage", "list", "--name-only"), cwd=folder, capture_output=True, text=True, check=True
+        _dvc("stage", "list", "--all", "--name-only"),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     work = shares(listed.stdout.split())
     rendered = [f"scene@{scene}" for scene in sorted({share.scene for share in work})]
     subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes", check=True)
     os.environ.update(_environment())  # of all that follows, copies too
-    start = time.monotonic()
+    start, tables = time.monotonic(), list[Process]()
 
     def table(what: str) -> None:
         print(f"[{(time.monotonic() - start) / 60:5.1f} min] made: {what}", flush=True)
-        subprocess.run([sys.executable, "-m", "stages.table", "--scene", "all"], cwd=folder)
+        for earlier in tables:
+            earlier.wait()
+        # Beside the rows: nobody waits for it.
+        tables[:] = [
+            subprocess.Popen([sys.executable, "-m", "stages.table", "--scene", "all"], cwd=folder)
+        ]
 
     made = _make(folder, work, table)
+    for last in tables:
+        last.wait()
     done = subprocess.run(_dvc("repro", "--quiet", "--single-item", "table"), cwd=folder)
     print(f"[{(time.monotonic() - start) / 60:5.1f} min] {folder / 'tables' / 'tables.md'}")
     return 0 if made and done.returncode == 0 else 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ def noted(tables: Iterable[Table], root: Path, runs: Mapping[Run, Path]) -> list
     """The tables, those of `runs` in `root` with a sentence under them where not all were made alike.
 
     So it is while a comparison is made anew after a change: in the end DVC has made all alike, and
-    nothing is said.
+    nothing is said. Lock files are those of the folders in `root`, one per scene.
     """
-    recorded, rows = read_recorded(root / LOCK), {row.key: row for row in ROWS if not row.name}
+    recorded = read_recorded(sorted(root.glob(f"*/{LOCK}")))
+    rows = {row.key: row for row in ROWS if not row.name}
     known = {
         key: _without_seed(recorded[place], rows[key[1]], key[2])
         for key, path in runs.items()
@@ -36,35 +37,43 @@ def noted(tables: Iterable[Table], root: Path, runs: Mapping[Run, Path]) -> list
     return [t if t.name in ("paper", "poses") else replace(t, notes=t.notes + told) for t in tables]
 
 
-def read_recorded(lock: Path) -> dict[str, dict[str, Any]]:
-    """By the path of each output what DVC's lock file says that it was made from: parameters by
-    "section of file", checksums of code and data by path. Empty without a file; UserError when damaged."""
-    if not lock.is_file():
-        return {}
+def read_recorded(locks: Sequence[Path]) -> dict[str, dict[str, Any]]:
+    """By the path of each output what DVC's lock files say that it was made from: parameters by
+    "section of file", checksums of code and data by path. UserError for a damaged file."""
+    recorded: dict[str, dict[str, Any]] = {}
+    for lock, text in zip(locks, _settled(locks), strict=True):
+        try:
+            for entry in YAML(typ="safe").load(text)["stages"].values():
+                recorded |= {out["path"]: _made_from(entry) for out in entry.get("outs", ())}
+        except (ValueError, KeyError, TypeError, AttributeError, YAMLError) as error:
+            raise _damaged(lock, error) from None
+    return recorded
+
+
+def _damaged(lock: Path, error: Exception) -> UserError:
+    return UserError(
+        f"{lock} is not a lock file of DVC ({type(error).__name__}).",
+        "Restore it, or remove it: DVC then makes its scene anew.",
+    )
+
+
+def _read(lock: Path) -> bytes:
     try:
-        stages = YAML(typ="safe").load(_settled(lock))["stages"]
-        return {
-            out["path"]: _made_from(entry)
-            for entry in stages.values()
-            for out in entry.get("outs", ())
-        }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, YAMLError) as error:
-        raise UserError(
-            f"{lock} is not a lock file of DVC ({type(error).__name__}).",
-            "Restore it, or remove it: DVC then makes everything anew.",
-        ) from None
+        return lock.read_bytes()
+    except OSError as error:
+        raise _damaged(lock, error) from None
 
 
-def _settled(lock: Path) -> str:
-    """The text of the lock file once nobody writes it: DVC does so in place, for a second or more, and
-    other rows may be made while the tables are. After PATIENCE looks the text as it is."""
-    text = lock.read_text(encoding="utf-8")
-    for _ in range(PATIENCE):
+def _settled(locks: Sequence[Path]) -> list[bytes]:
+    """The contents of the lock files once nobody writes them: DVC does so in place, for part of a second, and
+    other rows may be made while the tables are. After PATIENCE looks as they are."""
+    now = [_read(lock) for lock in locks]
+    for _ in range(PATIENCE if locks else 0):
         time.sleep(PAUSE)
-        before, text = text, lock.read_text(encoding="utf-8")
-        if text and text == before:
+        before, now = now, [_read(lock) for lock in locks]
+        if all(now) and now == before:
             break
-    return text
+    return now
 
 
 def _made_from(entry: Mapping[str, Any]) -> dict[str, Any]:

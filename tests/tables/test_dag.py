@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Client
@@ -21,7 +22,11 @@ from pipeline.tables.rows import ROWS
 from tests.test_architecture import true_code_dependencies
 
 TABLES = Path(__file__).resolve().parents[2] / "experiments/tables"
-DAG: dict[str, dict[str, Any]] = yaml.safe_load((TABLES / "stages.yaml").read_text())["stages"]
+DAG: dict[str, dict[str, Any]] = {
+    name: entry
+    for file in ("stages.yaml", "table.yaml")
+    for name, entry in yaml.safe_load((TABLES / file).read_text())["stages"].items()
+}
 UP = "../../../"
 
 
@@ -29,8 +34,8 @@ def stages_of(entry: dict[str, Any]) -> set[str]:
     words = [
         word
         for command in entry["cmd"]
-        if command.startswith("${steps}")
-        for word in command.removeprefix("${steps}").split("--")[0].split()
+        if (asked := re.search(r"(?:\$\{steps\}|experiments\.tables\.steps) ([a-z ]+) --", command))
+        for word in asked[1].split()
     ]
     return set(words)
 
@@ -59,9 +64,19 @@ def test_every_section_that_the_stages_read_is_followed(name: str) -> None:
 def test_a_profile_is_complete(profile: str) -> None:
     """Every section of every scene and variant validates, and the paths of variants are told."""
     file = TABLES / profile / "params.yaml"
-    assert (TABLES / profile / "dvc.yaml").resolve() == TABLES / "stages.yaml"
+    assert (TABLES / profile / "dvc.yaml").resolve() == TABLES / "table.yaml"
     content = read_params(file)
     comparison = content["comparison"]
+    folders = {path.parent for path in (TABLES / profile).glob("*/scene.yaml")}
+    assert {folder.name for folder in folders} == set(comparison["scenes"])
+    for folder in folders:
+        assert (folder / "dvc.yaml").resolve() == TABLES / "stages.yaml"
+        scene = yaml.safe_load((folder / "scene.yaml").read_text())
+        assert scene["scene"] == folder.name
+        rows = ["nerf", "derain", "unaveraged", "true", "clean"]
+        assert scene["rows"] == [
+            row for row in rows if row != "unaveraged" or folder.name in comparison["lens"]
+        ]
     table = importlib.import_module("stages.table").Params
     params = read_section(file, "table", table, "all")
     assert (params.scenes, params.lens, params.seeds) == tuple(
@@ -91,37 +106,49 @@ def test_variants_of_a_row_differ_in_their_seed_alone() -> None:
 
 
 def test_one_seed_of_everything_comes_before_the_next() -> None:
-    targets = [
-        "prepare@a", "restore@a-wen", "restore@a-quan", "fit@a-nerf-0", "fit@a-nerf-1",
-        "loop@a-0", "loop@a-1", "cleaned@a-wen-0", "cleaned@a-wen-1", "table",
+    names = [
+        "prepare", "restore@wen", "restore@quan", "fit@nerf-0", "fit@nerf-1",
+        "loop@0", "loop@1", "cleaned@wen-0", "cleaned@wen-1",
     ]  # fmt: skip
-    assert [share.targets for share in shares(targets)] == [
-        ["prepare@a"],
-        ["fit@a-nerf-0", "loop@a-0"],
-        ["restore@a-wen", "restore@a-quan"],
-        ["cleaned@a-wen-0"],
-        ["fit@a-nerf-1", "loop@a-1"],
-        ["cleaned@a-wen-1"],
+    targets = [f"a/dvc.yaml:{name}" for name in names]
+    assert [
+        [target.removeprefix("a/dvc.yaml:") for target in share.targets]
+        for share in shares([*targets, "table"])
+    ] == [
+        ["prepare"],
+        ["fit@nerf-0", "loop@0"],
+        ["restore@wen", "restore@quan"],
+        ["cleaned@wen-0"],
+        ["fit@nerf-1", "loop@1"],
+        ["cleaned@wen-1"],
     ]
 
 
 def test_every_target_is_made_once_and_within_its_own_scene() -> None:
-    """Names of scenes may begin with one another: street, street-move."""
-    scenes = ["street", "street-move", "move"]
-    targets = [f"prepare@{scene}" for scene in scenes]
-    targets += [f"{kind}@{scene}-nerf-0" for scene in scenes for kind in ("fit", "cleaned")]
-    made = shares([*targets, "table"])
-    assert sorted(t for share in made for t in share.targets) == sorted(targets)
+    """Those that DVC names in the quick profile; names of scenes begin with one another there."""
+    command = [sys.executable, "-m", "dvc", "stage", "list", "--all", "--name-only"]
+    listed = subprocess.run(
+        command, cwd=TABLES / "quick", capture_output=True, text=True, check=True
+    )
+    targets = listed.stdout.split()
+    made = shares(targets)
+    assert sorted([*(t for share in made for t in share.targets), "table"]) == sorted(targets)
     for share in made:
-        for target in share.targets:
-            assert target.split("@")[1] in {share.scene, f"{share.scene}-nerf-0"}
+        assert all(target.startswith(f"{share.scene}/dvc.yaml:") for target in share.targets)
+    rows = [row for row in ROWS if row.seeded and row.name == ""]
+    seeded = {share.what for share in made if "seed" in share.what}
+    assert len(seeded) == 6 and len(rows) * 3 * 5 - 2 * 3 == sum(
+        len(share.targets) for share in made if share.what in seeded
+    )
 
 
 def test_no_share_is_taken_before_what_it_needs_is_made() -> None:
     scenes = ("a", "b")
-    targets = [f"{kind}@{scene}{row}" for scene in scenes for kind, row in (
-        ("prepare", ""), ("fit", "-nerf-0"), ("restore", "-wen"), ("cleaned", "-wen-0")
-    )]  # fmt: skip
+    targets = [
+        f"{scene}/dvc.yaml:{name}"
+        for scene in scenes
+        for name in ("prepare", "fit@nerf-0", "restore@wen", "cleaned@wen-0")
+    ]
     waiting = shares(targets)
 
     def taken(*running: Share) -> Share:
@@ -129,19 +156,22 @@ def test_no_share_is_taken_before_what_it_needs_is_made() -> None:
         assert share is not None
         return share
 
+    def of(scene: str, name: str) -> list[str]:
+        return [f"{scene}/dvc.yaml:{name}"]
+
     first, second = taken(), taken()
-    assert [first.targets, second.targets] == [["prepare@a"], ["prepare@b"]]
+    assert [first.targets, second.targets] == [of("a", "prepare"), of("b", "prepare")]
     assert run._next(waiting, [first, second]) is None
     third = taken(first)
-    assert third.targets == ["fit@b-nerf-0"]
-    assert taken(first, third).targets == ["restore@b-wen"]
+    assert third.targets == of("b", "fit@nerf-0")
+    assert taken(first, third).targets == of("b", "restore@wen")
     fourth = taken()
-    assert fourth.targets == ["fit@a-nerf-0"]
+    assert fourth.targets == of("a", "fit@nerf-0")
     fifth = taken()
-    assert fifth.targets == ["restore@a-wen"]
-    assert taken(fifth).targets == ["cleaned@b-wen-0"]
+    assert fifth.targets == of("a", "restore@wen")
+    assert taken(fifth).targets == of("b", "cleaned@wen-0")
     assert run._next(waiting, [fifth]) is None
-    assert taken().targets == ["cleaned@a-wen-0"]
+    assert taken().targets == of("a", "cleaned@wen-0")
 
 
 def test_stages_run_in_a_copy_end_as_they_would_here(
@@ -167,7 +197,7 @@ def test_a_row_that_failed_is_told_by_the_exit_code(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """DVC makes the tables of what there is: that they were made says nothing of the rows."""
-    code = "import sys; sys.exit('fit@a-nerf-1' in sys.argv)"
+    code = "import sys; sys.exit('a/dvc.yaml:fit@nerf-1' in sys.argv)"
     monkeypatch.setattr(run, "_dvc", lambda *words: [sys.executable, "-c", code, *words])
     monkeypatch.setattr(run, "cores", lambda: 2)
     monkeypatch.setattr(run.signal, "signal", lambda number, how: None)
@@ -179,5 +209,6 @@ def test_a_row_that_failed_is_told_by_the_exit_code(
         monkeypatch.setattr(run.subprocess, "run", lambda *words, **how: done)
         return run.main()
 
-    assert runs("prepare@a fit@a-nerf-0 fit@a-true-0 table") == 0
-    assert runs("prepare@a fit@a-nerf-0 fit@a-nerf-1 table") == 1
+    a = "a/dvc.yaml:"
+    assert runs(f"{a}prepare {a}fit@nerf-0 {a}fit@true-0 table") == 0
+    assert runs(f"{a}prepare {a}fit@nerf-0 {a}fit@nerf-1 table") == 1
