@@ -107,12 +107,20 @@ def _dvc(*words: str) -> list[str]:
     return [sys.executable, "-m", "dvc", *words]
 
 
-def _next(waiting: list[Share], running: Iterable[Share]) -> Share | None:
-    """Takes the first share that has what it needs out of those waiting."""
+def _next(waiting: list[Share], running: Iterable[Share], cores: int) -> Share | None:
+    """Takes the first share that has what it needs out of those waiting.
+
+    When few are left, half of it: at the end no core shall wait for another's long share.
+    """
     ahead = {(share.scene, share.what) for share in (*waiting, *running)}
     for place, share in enumerate(waiting):
-        if not any((share.scene, need) in ahead for need in share.needs):
+        if any((share.scene, need) in ahead for need in share.needs):
+            continue
+        if len(waiting) > 2 * cores or len(share.targets) == 1:
             return waiting.pop(place)
+        half = (len(share.targets) + 1) // 2
+        waiting[place] = share._replace(targets=share.targets[half:])
+        return share._replace(targets=share.targets[:half])
     return None
 
 
@@ -136,13 +144,13 @@ def _make(folder: Path, waiting: list[Share], table: Callable[[str], None]) -> b
     ``table`` is called with every kind of share when its last one is there.
     """
     waiting, running, made = list(waiting), dict[int, tuple[Share, Process]](), True
-    left = Counter(share.what for share in waiting)
+    left = Counter(share.what for share in waiting for _ in share.targets)
     with serving() as warm:
         environment = {**os.environ, **warm}
         try:
             while waiting or running:
                 for core in set(range(cores())) - running.keys():
-                    share = _next(waiting, [one for one, _ in running.values()])
+                    share = _next(waiting, [one for one, _ in running.values()], cores())
                     if share is not None:
                         running[core] = share, _start(folder, share, core, environment)
                 time.sleep(0.2)
@@ -150,7 +158,7 @@ def _make(folder: Path, waiting: list[Share], table: Callable[[str], None]) -> b
                     if process.poll() is not None:
                         made &= process.returncode == 0
                         del running[core]
-                        left[share.what] -= 1
+                        left[share.what] -= len(share.targets)
                         if not left[share.what]:
                             table(share.what)
         finally:
@@ -165,16 +173,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=PROFILES)
     folder = HERE / parser.parse_args().profile
-    listed = subprocess.run(
-        _dvc("stage", "list", "--all", "--name-only"),
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = _dvc("stage", "list", "--all", "--name-only")
+    listed = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     work = shares(listed.stdout.split())
     rendered = [f"scene@{scene}" for scene in sorted({share.scene for share in work})]
-    subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes", check=True)
+    scenes = subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes")
+    if listed.returncode or scenes.returncode:
+        return 1  # DVC has said why
     os.environ.update(_environment())  # of all that follows, copies too
     start, tables = time.monotonic(), list[Process]()
 
@@ -196,4 +201,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit("Stopped. What is finished stays; the same command goes on from there.")

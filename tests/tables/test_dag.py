@@ -152,7 +152,7 @@ def test_no_share_is_taken_before_what_it_needs_is_made() -> None:
     waiting = shares(targets)
 
     def taken(*running: Share) -> Share:
-        share = run._next(waiting, running)
+        share = run._next(waiting, running, 1)
         assert share is not None
         return share
 
@@ -161,7 +161,7 @@ def test_no_share_is_taken_before_what_it_needs_is_made() -> None:
 
     first, second = taken(), taken()
     assert [first.targets, second.targets] == [of("a", "prepare"), of("b", "prepare")]
-    assert run._next(waiting, [first, second]) is None
+    assert run._next(waiting, [first, second], 1) is None
     third = taken(first)
     assert third.targets == of("b", "fit@nerf-0")
     assert taken(first, third).targets == of("b", "restore@wen")
@@ -170,8 +170,19 @@ def test_no_share_is_taken_before_what_it_needs_is_made() -> None:
     fifth = taken()
     assert fifth.targets == of("a", "restore@wen")
     assert taken(fifth).targets == of("b", "cleaned@wen-0")
-    assert run._next(waiting, [fifth]) is None
+    assert run._next(waiting, [fifth], 1) is None
     assert taken().targets == of("a", "cleaned@wen-0")
+
+
+def test_the_last_shares_are_handed_out_in_halves() -> None:
+    """Each smaller than the one before, and every target once."""
+    names = [f"{scene}/dvc.yaml:fit@{row}-0" for scene in "abcdef" for row in range(8)]
+    waiting, taken = shares(names), []
+    while share := run._next(waiting, [], 2):
+        taken.append(share.targets)
+    assert [target for targets in taken for target in targets] == names
+    assert [len(targets) for targets in taken[:2]] == [8, 8], "there are enough shares yet"
+    assert [len(targets) for targets in taken[-4:]] == [4, 2, 1, 1]
 
 
 def test_stages_run_in_a_copy_end_as_they_would_here(
