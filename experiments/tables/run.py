@@ -175,11 +175,13 @@ def main() -> int:
     folder = HERE / parser.parse_args().profile
     command = _dvc("stage", "list", "--all", "--name-only")
     listed = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True)
+    if listed.returncode:
+        return 1  # DVC has said why
     work = shares(listed.stdout.split())
     rendered = [f"scene@{scene}" for scene in sorted({share.scene for share in work})]
     scenes = subprocess.run(_dvc("repro", "--quiet", *rendered), cwd=HERE.parent / "scenes")
-    if listed.returncode or scenes.returncode:
-        return 1  # DVC has said why
+    if scenes.returncode:
+        return 1
     os.environ.update(_environment())  # of all that follows, copies too
     start, tables = time.monotonic(), list[Process]()
 
