@@ -60,8 +60,10 @@ def map_named(
 def cut(count: int, longest: int, workers: int) -> list[range]:
     """Runs of consecutive numbers below `count`, none longer than `longest`, so that all workers are busy.
 
-    As many as workers, or a multiple; their lengths differ by one at most.
+    As many as workers, or a multiple; their lengths differ by one at most. None below 1.
     """
+    if count < 1:
+        return []
     runs = min(count, -(-count // (longest * workers)) * workers)
     ends = [count * k // runs for k in range(runs + 1)]
     return [range(first, last) for first, last in pairwise(ends)]

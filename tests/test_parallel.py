@@ -48,6 +48,7 @@ def test_runs_keep_all_workers_busy() -> None:
     assert cut(24, 8, 2) == [range(0, 6), range(6, 12), range(12, 18), range(18, 24)]
     assert cut(7, 8, 2) == [range(0, 3), range(3, 7)]
     assert cut(3, 8, 16) == [range(0, 1), range(1, 2), range(2, 3)]
+    assert cut(0, 8, 2) == []
     assert cut(20, 8, 1) == [range(0, 6), range(6, 13), range(13, 20)]
 
 
