@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.optim.adamw import adamw
 
+from pipeline.field.adam import Moments, Settings, advance, advance_and_clear, at_rest
 from pipeline.field.base import Field, Part, TableGradient
 from pipeline.field.buffer import Batch
 
@@ -32,20 +32,8 @@ class Exposure(nn.Module):
         return [Part("log_gain", ("log_gain",), 1e-2, 0.1, warmup=50)]
 
 
-class Moments(NamedTuple):
-    """What Adam knows of a parameter: the running means of its gradient and of its square, and its steps."""
-
-    exp_avg: Tensor
-    exp_avg_sq: Tensor
-    step: Tensor
-
-
 class Stepper:
-    """AdamW (arXiv:1711.05101) for one part of a field, at a rate that depends on the step alone.
-
-    torch's own steps, without ``torch.optim.AdamW`` around them, which loads torch's compiler: one to two
-    seconds at the start of every fit.
-    """
+    """Adam for one part of a field, at a rate that depends on the step alone."""
 
     def __init__(
         self, part: Part, parameters: list[nn.Parameter], steps: int, rate: float = 1.0
@@ -66,41 +54,38 @@ class Stepper:
         self.now = self.rate_at(step)
         self.apply(gradients)
 
-    @torch.no_grad()
     def apply(self, gradients: Sequence[Tensor | None]) -> None:
         """As :meth:`step`, at the rate that was set last."""
-        named = zip(self.part.parameters, self.parameters, gradients, strict=True)
-        moved = [(name, one, gradient) for name, one, gradient in named if gradient is not None]
-        if not moved:
-            return
-        for name, parameter, _ in moved:
+        part = self.part
+        parameters, passed, known = list[Tensor](), list[Tensor](), list[Moments]()
+        settings = Settings(self.now, part.betas, part.eps, part.decay)
+        for name, parameter, gradient in zip(
+            part.parameters, self.parameters, gradients, strict=True
+        ):
+            if gradient is None:
+                continue
             if name not in self.moments:
-                self.moments[name] = _at_rest(parameter)
-        exp_avgs, exp_avg_sqs, steps = zip(*(self.moments[name] for name, *_ in moved), strict=True)
-        beta1, beta2 = self.part.betas
-        adamw(
-            [parameter for _, parameter, _ in moved],
-            [gradient for *_, gradient in moved],
-            list(exp_avgs),
-            list(exp_avg_sqs),
-            [],
-            list(steps),
-            fused=True,
-            amsgrad=False,
-            maximize=False,
-            beta1=beta1,
-            beta2=beta2,
-            lr=self.now,
-            weight_decay=self.part.decay,
-            eps=self.part.eps,
-        )
+                self.moments[name] = at_rest(parameter)
+            moments = self.moments[name]
+            if gradient is self.rooms.get(name) and gradient.device.type == "cpu":
+                advance_and_clear(parameter, gradient, moments, settings)
+            else:
+                parameters.append(parameter)
+                passed.append(gradient)
+                known.append(moments)
+        if parameters:
+            advance(parameters, passed, known, settings)
 
     def room(self, name: str) -> Tensor:
-        """Zeros of a parameter's shape to add its gradient up in, the same memory in every step."""
+        """Zeros of a parameter's shape to add its gradient up in, the same memory in every step.
+
+        On a CPU the step clears it.
+        """
         if name not in self.rooms:
             place = self.part.parameters.index(name)
             self.rooms[name] = torch.zeros_like(self.parameters[place])
-        return self.rooms[name].zero_()
+        room = self.rooms[name]
+        return room if room.device.type == "cpu" else room.zero_()
 
     def state(self) -> dict[str, Tensor]:
         """Adam's running moments by name; what :meth:`restore` takes back."""
@@ -117,12 +102,6 @@ class Stepper:
             for name in self.part.parameters
             if f"step:{name}" in state
         }
-
-
-def _at_rest(parameter: nn.Parameter) -> Moments:
-    """The moments before the first step."""
-    still = torch.zeros((), device=parameter.device)
-    return Moments(torch.zeros_like(parameter), torch.zeros_like(parameter), still)
 
 
 class Average:

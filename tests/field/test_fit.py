@@ -235,8 +235,9 @@ def test_products_are_of_the_precision_asked_for(
     assert record.rows[-1][2] > record.rows[0][2] + 0.5
 
 
-def test_steps_are_those_of_adamw() -> None:
-    """With decay, and for a parameter that has no gradient in some steps."""
+@pytest.mark.parametrize("as_table", [False, True])
+def test_steps_are_those_of_adamw(as_table: bool) -> None:
+    """With decay, and for a parameter that has no gradient in some steps; a table's gradient is cleared."""
     start = [torch.randn(7, 3, generator=torch.Generator().manual_seed(i)) for i in range(2)]
     ours, theirs = ([torch.nn.Parameter(one.clone()) for one in start] for _ in range(2))
     part = Part("both", ("a", "b"), 1e-2, 0.1, (0.8, 0.95), 1e-9, warmup=2, decay=0.3)
@@ -245,7 +246,11 @@ def test_steps_are_those_of_adamw() -> None:
     for step in range(6):
         a, b = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(9 + step))
         gradients = [a, None if step == 2 else b]
-        stepper.step(step, gradients)
+        if as_table:
+            stepper.step(step, [stepper.room("a").copy_(a), gradients[1]])
+            assert not stepper.room("a").any()
+        else:
+            stepper.step(step, gradients)
         adam.param_groups[0]["lr"] = stepper.rate_at(step)
         for parameter, gradient in zip(theirs, gradients, strict=True):
             parameter.grad = gradient
