@@ -187,6 +187,8 @@ def main() -> int:
 
     def table(what: str) -> None:
         print(f"[{(time.monotonic() - start) / 60:5.1f} min] made: {what}", flush=True)
+        if what == PHOTOS:
+            return  # no row yet
         for earlier in tables:
             earlier.wait()
         # Beside the rows: nobody waits for it.

@@ -19,8 +19,7 @@ from pathlib import Path
 
 from experiments.tables.steps import ADDRESS, run_stages
 
-# Those of the rows, of which there are many; what is done once per scene loads what it needs besides.
-LOADED = ["stages.refine", "stages.nerf", "stages.render", "stages.evaluate"]
+LOADED = ["experiments.tables.loaded"]
 MOST = 64  # that may ask at the same moment
 # An exit code can be read once. Starting a process reads those of all others that have ended, so that two
 # threads would race for it, and the loser take a finished copy for a failed one.

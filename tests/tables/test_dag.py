@@ -204,6 +204,20 @@ def test_stages_run_in_a_copy_end_as_they_would_here(
     assert steps.main([]) == 1
 
 
+def test_copies_have_the_rows_stages_and_a_fits_machine_code() -> None:
+    """Of a process of its own, as theirs is: what one step has not compiled, the next would."""
+    code = (
+        "import sys; from experiments.tables import loaded; "
+        "from pipeline.field import adam, kernels, table_kernels as rows; "
+        "assert all(f'stages.{name}' in sys.modules for name in loaded.STAGES); "
+        "fetched = (adam._stepped, kernels.walk, rows.read_rows, rows.add_rows); "
+        "assert all(one.signatures for one in fetched); "
+        "before = [list(one.signatures) for one in fetched]; loaded._tiny(); "
+        "assert before == [list(one.signatures) for one in fetched]"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=TABLES.parents[1], check=True)
+
+
 def test_a_row_that_failed_is_told_by_the_exit_code(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

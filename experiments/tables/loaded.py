@@ -1,0 +1,38 @@
+"""What has been loaded in the process that the rows' processes are copies of: the stages of rows, of which there
+are many, and the machine code of a fit and a view, which a tiny one of each fetches. What is done once per scene
+loads what it needs besides.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+
+from pipeline.field.buffer import PosedPhoto, RayBuffer
+from pipeline.field.fit import fit
+from pipeline.field.model import build_around
+from pipeline.field.render import render_view
+from pipeline.io.transforms import View
+
+STAGES = ("refine", "nerf", "render", "evaluate")
+SIDE = 8  # pixels
+
+
+def _tiny() -> None:
+    """A step of a fit to one dark photo, and a view of it."""
+    middle, size = SIDE / 2, (SIDE, SIDE)
+    view = View("dark", np.eye(4), SIDE, SIDE, middle, middle, 0.0, *size, near=1.0, far=2.0)
+    photo = PosedPhoto(
+        view.name, np.zeros((*size, 3), np.float32), np.ones(size, np.bool_),
+        view.cam_from_world, view.intrinsics, view.near, view.far,
+    )  # fmt: skip
+    settings = {"resolution": 32, "table_log2": 10, "distortion": 0.002}
+    field = build_around("fast", [view], view.near, view.far, **settings)
+    fit(field, RayBuffer([photo], 0), steps=1, batch_rays=16, seed=0, shards=1, threads=1)
+    render_view(field, view.cam_from_world, view.intrinsics, size, view.near, view.far)
+
+
+for stage in STAGES:
+    importlib.import_module(f"stages.{stage}")
+_tiny()
