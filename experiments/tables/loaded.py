@@ -1,11 +1,11 @@
-"""What has been loaded in the process that the rows' processes are copies of: the stages of rows, of which there
-are many, and the machine code of a fit and a view, which a tiny one of each fetches. What is done once per scene
-loads what it needs besides.
+"""What is loaded where the rows' processes are copied from: the stages of rows, of which there are many, and the
+machine code of a fit and a view, fetched by a tiny one of each. What is done once per scene loads the rest itself.
 """
 
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +27,8 @@ def _tiny() -> None:
         view.name, np.zeros((*size, 3), np.float32), np.ones(size, np.bool_),
         view.cam_from_world, view.intrinsics, view.near, view.far,
     )  # fmt: skip
-    settings = {"resolution": 32, "table_log2": 10, "distortion": 0.002}
-    field = build_around("fast", [view], view.near, view.far, **settings)
+    sizes: dict[str, Any] = {"resolution": 32, "table_log2": 10, "distortion": 0.002}
+    field = build_around("fast", [view], view.near, view.far, **sizes)
     fit(field, RayBuffer([photo], 0), steps=1, batch_rays=16, seed=0, shards=1, threads=1)
     render_view(field, view.cam_from_world, view.intrinsics, size, view.near, view.far)
 
