@@ -1,5 +1,5 @@
-"""What is loaded where the rows' processes are copied from: the stages of rows, of which there are many, and the
-machine code of a fit and a view, fetched by a tiny one of each. What is done once per scene loads the rest itself.
+"""What is loaded where the rows' processes are copied from: the stages of rows, of which there are many, and
+the machine code of a fit and a view, fetched by a tiny one of each. What is done once per scene loads itself.
 """
 
 from __future__ import annotations
