@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import zlib  # noqa: F401
 from dataclasses import replace
@@ -77,10 +78,8 @@ def _model() -> pycolmap.Reconstruction:
     return model
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _exported(root: Path, params: export.Params, origin: tuple[float, float, float]) -> Path:
     """A scene of a grey wall at depth 2, dropped at the left in b, with its views; exported."""
-    root = tmp_path_factory.mktemp("export")
     job = Job(root, "made", None, "cpu", None, False)
     paths = job.paths
     grey = np.full((HEIGHT, WIDTH, 3), 0.5)
@@ -95,10 +94,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_depth(paths.views / "depth" / f"{name[0]}.exr", np.full((HEIGHT, WIDTH), 2.0))
     records = [ImageRecord(n, n, "", WIDTH, HEIGHT, None, "train", 0) for n in NAMES]
     write_images_json(paths.images, records)
-    write_transforms(paths.poses / "transforms.json", VIEWS)
+    views = [dataclasses.replace(view, origin=origin) for view in VIEWS]
+    write_transforms(paths.poses / "transforms.json", views)
     write_sparse(_model(), paths.poses / "sparse")
-    export.main(job, PARAMS)
+    export.main(job, params)
     return paths.artifacts / "export"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything, of a world that begins where the capture's does."""
+    return _exported(tmp_path_factory.mktemp("export"), PARAMS, (0.0, 0.0, 0.0))
 
 
 def test_the_common_pinhole_is_covered_wholly_and_no_wider() -> None:
@@ -181,6 +187,15 @@ def test_our_own_door_reads_it_back(made: Path, door: str) -> None:
         assert np.allclose(back.cam_from_world, sent.cam_from_world, atol=1e-9)
         assert back.intrinsics == pytest.approx(sent.intrinsics)
     assert capture.masked_by == ("rainMask.npy" if door == "llff" else "mask pictures")
+
+
+def test_points_lie_where_the_capture_had_them(made: Path, tmp_path: Path) -> None:
+    """Metres of UTM, sparse and dense, to a tenth of a millimetre."""
+    utm = (412345.678, 5_654_321.25, 312.5)
+    far = _exported(tmp_path, PARAMS.model_copy(update={"formats": ["ply"]}), utm)
+    for name in ("sparse", "dense"):
+        here, there = (read_ply(folder / f"ply/{name}.ply")[0] for folder in (made, far))
+        assert np.allclose(there - np.array(utm), here, rtol=0, atol=1e-4)
 
 
 def test_photos_depth_and_points(made: Path) -> None:
