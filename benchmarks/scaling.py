@@ -106,7 +106,7 @@ def stages(settings: dict[str, Any]) -> None:
     def step_alone() -> None:
         for total in totals:
             total.zero_()
-        advance(tables, totals, moments, pace)
+        advance(list(zip(tables, totals, moments, strict=True)), pace)
 
     def step_and_clear() -> None:
         for one, total, known in zip(tables, totals, moments, strict=True):

@@ -81,10 +81,11 @@ def _kinds(seeds: Sequence[str]) -> list[_Kind]:
 def shares(names: Sequence[str]) -> list[Share]:
     """All targets but the table, in the order in which they should be made."""
     targets = [_target(name) for name in names if "/" in name]
+    scenes = sorted({target.scene for target in targets})
     seeds = sorted({target.seed for target in targets} - {""})
     made = []
     for what, stages, seed, needs in _kinds(seeds):
-        for scene in sorted({target.scene for target in targets}):
+        for scene in scenes:
             chosen = [
                 target.name
                 for stage in stages
@@ -138,10 +139,10 @@ def _start(folder: Path, share: Share, core: int, environment: dict[str, str]) -
     return subprocess.Popen(command + share.targets, cwd=folder, env=environment, preexec_fn=pinned)
 
 
-def _make(folder: Path, waiting: list[Share], table: Callable[[str], None]) -> bool:
+def _make(folder: Path, waiting: list[Share], table: Callable[[str, bool], None]) -> bool:
     """Makes the shares, one per core at a time; whether all were made.
 
-    ``table`` is called with every kind of share when its last one is there.
+    ``table`` is called with every kind of share when its last one is there, and whether more are to come.
     """
     waiting, running, made = list(waiting), dict[int, tuple[Share, Process]](), True
     left = Counter(share.what for share in waiting for _ in share.targets)
@@ -160,7 +161,7 @@ def _make(folder: Path, waiting: list[Share], table: Callable[[str], None]) -> b
                         del running[core]
                         left[share.what] -= len(share.targets)
                         if not left[share.what]:
-                            table(share.what)
+                            table(share.what, bool(waiting or running))
         finally:
             for _, process in running.values():
                 process.terminate()
@@ -185,16 +186,13 @@ def main() -> int:
     os.environ.update(_environment())  # of all that follows, copies too
     start, tables = time.monotonic(), list[Process]()
 
-    def table(what: str) -> None:
+    def table(what: str, more: bool) -> None:
         print(f"[{(time.monotonic() - start) / 60:5.1f} min] made: {what}", flush=True)
-        if what == PHOTOS:
-            return  # no row yet
-        for earlier in tables:
-            earlier.wait()
-        # Beside the rows: nobody waits for it.
-        tables[:] = [
-            subprocess.Popen([sys.executable, "-m", "stages.table", "--scene", "all"], cwd=folder)
-        ]
+        # Beside the rows, which do not wait for it; before the first and after the last there is no need.
+        busy = any(earlier.poll() is None for earlier in tables)
+        if what != PHOTOS and more and not busy:
+            command = [sys.executable, "-m", "stages.table", "--scene", "all"]
+            tables[:] = [subprocess.Popen(command, cwd=folder)]
 
     made = _make(folder, work, table)
     for last in tables:

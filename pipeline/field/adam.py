@@ -43,13 +43,9 @@ def at_rest(parameter: Tensor) -> Moments:
 
 
 @torch.no_grad()
-def advance(
-    parameters: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    moments: Sequence[Moments],
-    settings: Settings,
-) -> None:
-    """One step of all parameters and their moments."""
+def advance(moved: Sequence[tuple[Tensor, Tensor, Moments]], settings: Settings) -> None:
+    """One step of all parameters and their moments; ``moved``: parameter, gradient and moments of each."""
+    parameters, gradients, moments = zip(*moved, strict=True)
     adamw(
         list(parameters),
         list(gradients),

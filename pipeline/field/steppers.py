@@ -56,8 +56,7 @@ class Stepper:
 
     def apply(self, gradients: Sequence[Tensor | None]) -> None:
         """As :meth:`step`, at the rate that was set last."""
-        part = self.part
-        parameters, passed, known = list[Tensor](), list[Tensor](), list[Moments]()
+        part, moved = self.part, list[tuple[Tensor, Tensor, Moments]]()
         settings = Settings(self.now, part.betas, part.eps, part.decay)
         for name, parameter, gradient in zip(
             part.parameters, self.parameters, gradients, strict=True
@@ -70,11 +69,9 @@ class Stepper:
             if gradient is self.rooms.get(name) and gradient.device.type == "cpu":
                 advance_and_clear(parameter, gradient, moments, settings)
             else:
-                parameters.append(parameter)
-                passed.append(gradient)
-                known.append(moments)
-        if parameters:
-            advance(parameters, passed, known, settings)
+                moved.append((parameter, gradient, moments))
+        if moved:
+            advance(moved, settings)
 
     def room(self, name: str) -> Tensor:
         """Zeros of a parameter's shape to add its gradient up in, the same memory in every step.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import zlib  # noqa: F401
 from dataclasses import replace
@@ -94,7 +93,7 @@ def _exported(root: Path, params: export.Params, origin: tuple[float, float, flo
         write_depth(paths.views / "depth" / f"{name[0]}.exr", np.full((HEIGHT, WIDTH), 2.0))
     records = [ImageRecord(n, n, "", WIDTH, HEIGHT, None, "train", 0) for n in NAMES]
     write_images_json(paths.images, records)
-    views = [dataclasses.replace(view, origin=origin) for view in VIEWS]
+    views = [replace(view, origin=origin) for view in VIEWS]
     write_transforms(paths.poses / "transforms.json", views)
     write_sparse(_model(), paths.poses / "sparse")
     export.main(job, params)
