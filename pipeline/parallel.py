@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import dask
+from dask import threaded
 from dask.callbacks import Callback
 from dask.delayed import Delayed, delayed
 from tqdm import tqdm
@@ -96,7 +97,8 @@ def _on_threads(
         # A pool of our own: leaving it waits for what still runs when a task fails, so that nothing
         # is written into a folder that has been given up.
         with ThreadPoolExecutor(workers) as pool, bar, step:
-            how = {"scheduler": "threads", "num_workers": workers, "pool": pool}
+            # By its function: by its name, dask would load its cluster's library first.
+            how = {"scheduler": threaded.get, "num_workers": workers, "pool": pool}
             results = dask.compute(*tasks.values(), optimize_graph=False, **how)
     finally:
         if torch is not None:

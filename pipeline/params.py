@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,13 +59,14 @@ def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     if file.resolve() in above:
         raise UserError(f"{file} builds on itself ({BASE}: {above[-1]} names it).", CORRECT)
     try:
-        content = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+        content = copy.deepcopy(_parsed(file.read_text(encoding="utf-8")))
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}).", "Check the file.") from None
     except (YAMLError, ValueError, RecursionError) as error:  # no text, no such date, too deep
         raise UserError(f"{file} is not valid YAML{_place(error)}.", CORRECT) from None
     content = _mapping(file, "the file", content)
-    known = (*stage_names(), *OTHER_SECTIONS, BASE)
+    stages = stage_names()
+    known = (*stages, *OTHER_SECTIONS, BASE)
     _refuse_unknown(file, "section", content, known)
     if BASE in content:
         below = read_params(file.parent / str(content[BASE]), (*above, file.resolve()))
@@ -74,10 +77,16 @@ def read_params(file: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     for kind in NAMED:
         for name, values in (content.get(kind) or {}).items():
             overrides = _mapping(file, f"{kind}.{name}", values or {})
-            allowed = [*stage_names(), *([FOLDERS] if kind == "variants" else [])]
+            allowed = [*stages, *([FOLDERS] if kind == "variants" else [])]
             _refuse_unknown(file, f"section in {kind}.{name}", overrides, allowed)
     _refuse_unfollowed(file, content)
     return content
+
+
+@lru_cache(maxsize=8)
+def _parsed(text: str) -> Any:
+    """What a file says. Stages that run in one process ask for the same few files again and again."""
+    return YAML(typ="safe").load(text)
 
 
 def _refuse_unfollowed(file: Path, content: Mapping[str, Any]) -> None:

@@ -1,10 +1,12 @@
 """What is loaded where the rows' processes are copied from: the stages of rows, of which there are many, and
-the machine code of a fit and a view, fetched by a tiny one of each. What is done once per scene loads itself.
+the machine code of a fit and a view, fetched by a tiny one of each; the parameters that all profiles build on.
+What is done once per scene loads itself.
 """
 
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from pipeline.field.fit import fit
 from pipeline.field.model import build_around
 from pipeline.field.render import render_view
 from pipeline.io.transforms import View
+from pipeline.params import read_params
 
 STAGES = ("refine", "nerf", "render", "evaluate")
 SIDE = 8  # pixels
@@ -36,3 +39,4 @@ def _tiny() -> None:
 for stage in STAGES:
     importlib.import_module(f"stages.{stage}")
 _tiny()
+read_params(Path(__file__).with_name("params.yaml"))
