@@ -1,9 +1,10 @@
 """Fetches the clean photographs that the shipped weights were trained on, from Debian packages.
 
-`python -m experiments.detector.photos OUT` writes OUT/train, OUT/unseen (kept for scoring: painted on,
-and dry) and OUT/dry (kept for scoring, dry only), JPEG, longest side 1600. They are pictures of Debian's
-main archive, whose licences allow all uses of the project; they are not part of it. Needs a Debian
-machine (`apt-get download`, `dpkg-deb`).
+`python -m experiments.detector.photos OUT` writes OUT/train, OUT/more (those and sixteen further ones, for
+weights/unet-difference.safetensors), OUT/unseen (kept for scoring: painted on, and dry) and OUT/dry (kept
+for scoring, dry only), JPEG, longest side 1600. They are pictures of Debian's main archive, whose licences
+allow all uses of the project; they are not part of it. Needs a machine with Debian 12 (`apt-get download`,
+`dpkg-deb`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import tempfile
+import urllib.request
 from pathlib import Path
 
 import cv2
@@ -54,6 +56,26 @@ PHOTOS: dict[str, tuple[str, tuple[str, ...]]] = {
         "text/scenetext_segmented_word05.jpg",
     )),
 }  # fmt: skip
+# In OUT/more alone. A path names a package of another release of Debian's archive.
+BUDGIE = "b/budgie-backgrounds/budgie-backgrounds_3.0-1_all.deb"
+JXL = "libj/libjxl-testdata/libjxl-testdata_0.0~git20240106.ff8d743-2_all.deb"
+ARCHIVE = "http://deb.debian.org/debian/pool/main/"
+FURTHER: dict[str, tuple[str, tuple[str, ...]]] = {
+    BUDGIE: (f"{BACKGROUNDS}/budgie", (
+        "beacon-street-sunset.jpg", "canyon-wren.jpg", "casa-mila.jpg", "lake-sherburne.jpg",
+        "oakland-zoo-otters.jpg", "perched-osprey.jpg", "roman-colosseum.jpg",
+        "singaporean-cityscape.jpg", "tea-gardens.jpg",
+    )),
+    "palapeli-data": ("usr/share/palapeli/collection", (
+        "castle-maintenon.jpg", "cincinnati-bridge.jpg", "european-honey-bee.jpg",
+        "panther-chameleon-female.jpg",
+    )),
+    JXL: ("usr/share/libjxl-testdata", (
+        "jxl/jpeg_reconstruction/bicycles_restarts.jpg",
+        "external/wesaturate/500px/tmshre_riaphotographs_srgb8.png",
+        "external/wesaturate/500px/u76c0g_bliznaca_srgb8.png",
+    )),
+}  # fmt: skip
 # Never trained on: a street, a house, signs, a lawn with a barrier, mountains, an animal, a forest.
 UNSEEN = ("leuvenA", "home", "scenetext01", "scenetext05", "picosdeeuropa_by_Aitzol_Berasategi",
           "squirrel_cls", "summer_1am", "Garden")  # fmt: skip
@@ -65,16 +87,27 @@ LONGEST = 1600
 
 def fetch(out: Path) -> None:
     """Downloads the packages and writes their photographs."""
-    for package, (beginning, names) in PHOTOS.items():
-        with tempfile.TemporaryDirectory() as folder:
-            subprocess.run(["apt-get", "download", package], cwd=folder, check=True)
-            (archive,) = Path(folder).glob("*.deb")
-            subprocess.run(["dpkg-deb", "-x", archive, folder], check=True)
-            for name in names:
-                _keep(Path(folder) / beginning / name, package, out)
+    for packages, kinds in ((PHOTOS, ("train", "more")), (FURTHER, ("more",))):
+        for package, (beginning, names) in packages.items():
+            with tempfile.TemporaryDirectory() as folder:
+                archive = _download(package, Path(folder))
+                subprocess.run(["dpkg-deb", "-x", archive, folder], check=True)
+                for name in names:
+                    _keep(Path(folder) / beginning / name, package, out, kinds)
 
 
-def _keep(source: Path, package: str, out: Path) -> None:
+def _download(package: str, folder: Path) -> Path:
+    """The package's file: of the release that is installed here, or of the archive where it is a path there."""
+    if "/" in package:
+        target = folder / Path(package).name
+        urllib.request.urlretrieve(ARCHIVE + package, target)
+        return target
+    subprocess.run(["apt-get", "download", package], cwd=folder, check=True)
+    (archive,) = folder.glob("*.deb")
+    return archive
+
+
+def _keep(source: Path, package: str, out: Path, kinds: tuple[str, ...]) -> None:
     photo = cv2.imread(str(source))
     if photo is None:
         raise SystemExit(f"{package} no longer holds {source.name}.")
@@ -83,11 +116,12 @@ def _keep(source: Path, package: str, out: Path) -> None:
     factor = LONGEST / max(photo.shape[:2])
     if factor < 1:
         photo = cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    kind = "unseen" if stem in UNSEEN else "dry" if stem in DRY else "train"
-    target = out / kind / f"{stem}.jpg"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(target), photo, [cv2.IMWRITE_JPEG_QUALITY, 95])
-    print(f"{package}: {target}")
+    kinds = ("unseen",) if stem in UNSEEN else ("dry",) if stem in DRY else kinds
+    for kind in kinds:
+        target = out / kind / f"{stem}.jpg"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(target), photo, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        print(f"{package}: {target}")
 
 
 def main() -> None:
