@@ -84,6 +84,7 @@ class Field(Protocol):
     ) -> tuple[Tensor, Tensor]:
         """The loss to descend, and the plain photometric loss (eq. 4) within it.
 
+        ``generator`` was seeded for this call: all its random numbers are the first of that seed's.
         ``gain`` ``(R, 3)`` multiplies the rendered colours: the exposure of each ray's photo.
         """
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,18 +28,33 @@ def walk(
     space: Space, rays_o: Tensor, rays_d: Tensor, near: Tensor, far: Tensor, s: Tensor
 ) -> Tensor:
     """Unit-cube positions ``(3, R, K)`` of normalised depths ``s`` ``(R, K)`` or ``(1, K)``."""
-    matrix = torch.tensor(space.ref_from_world, dtype=torch.float32)
-    o = torch.addmm(matrix[:, 3:], matrix[:, :3], rays_o)
-    d = matrix[:, :3] @ rays_d
-    low = np.array(space.low, np.float32)
-    scale = np.array(
-        [1.0 / (b - a) for a, b in zip(space.low, space.high, strict=True)], np.float32
-    )
+    turn, shift, low, scale = _frame(space)
+    o, d = torch.addmm(shift, turn, rays_o), turn @ rays_d
     out = torch.empty(3, o.shape[1], s.shape[1])
     kernels.walk(
         o.numpy(), d.numpy(), near.numpy(), far.numpy(), s.numpy(),
         space.kind == "ndc", np.float32(space.near), low, scale, out.numpy(),
     )  # fmt: skip
+    return out
+
+
+@lru_cache(maxsize=8)
+def _frame(space: Space) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray]:
+    """The space's turn (3, 3) and shift (3, 1) of the world, its low corner and its scale (3,)."""
+    matrix = torch.tensor(space.ref_from_world, dtype=torch.float32)
+    scale = [1.0 / (high - low) for low, high in zip(space.low, space.high, strict=True)]
+    return (
+        matrix[:, :3], matrix[:, 3:], np.array(space.low, np.float32), np.array(scale, np.float32)
+    )  # fmt: skip
+
+
+def first_uniform(generator: torch.Generator, count: int) -> Tensor:
+    """The first numbers ``(count,)`` in [0, 1) of a generator as it was seeded; torch takes five times as long.
+
+    Where the generator stands does not matter, and it stays there.
+    """
+    out = torch.empty(count)
+    kernels.uniform(np.uint32(generator.initial_seed() & 0xFFFFFFFF), out.numpy())
     return out
 
 

@@ -20,6 +20,7 @@ from pipeline.field.encoding import (
 from pipeline.field.losses import distortion_loss, masked_photometric_loss, proposal_loss
 from pipeline.field.sampling import (
     depth_at,
+    in_strata,
     intervals_around,
     invert_histogram,
     middles,
@@ -154,9 +155,15 @@ class GridField(nn.Module):
 
     def _noise(self, rays: Rays, generator: torch.Generator) -> Noise:
         count, bins, near = rays.near.shape[0], self.config.bins, rays.near
+        samples = self.config.samples
+        if self._fused(rays):
+            drawn = fused.first_uniform(generator, count * (4 * bins + samples))
+            parts = drawn.split([count * bins, 3 * count * bins, count * samples])
+            shares = in_strata(parts[2].view(count, samples))
+            return Noise(parts[0].view(count, bins), parts[1].view(3, count, bins), shares)
         along = torch.rand(count, bins, generator=generator, device=near.device)
         shake = torch.rand(3, count, bins, generator=generator, device=near.device)
-        return Noise(along, shake, stratified(count, self.config.samples, generator, near))
+        return Noise(along, shake, stratified(count, samples, generator, near))
 
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""

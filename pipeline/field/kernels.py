@@ -73,6 +73,41 @@ def walk(o, d, near, far, s, ndc, space_near, low, scale, out):  # type: ignore[
             out[2, r, k] = _warped(ndc, x, y, z, space_near, low, scale, 2)
 
 
+@inlined
+def _twist(state, first, last, ahead):  # type: ignore[no-untyped-def]
+    """Renews the words ``first`` to ``last`` of a generator's state from those ``ahead`` of them."""
+    one = np.uint32(1)
+    for k in range(first, last):
+        y = (state[k] & np.uint32(0x80000000)) | (state[k + 1] & np.uint32(0x7FFFFFFF))
+        odd = np.uint32(0) - (y & one)
+        state[k] = state[k + ahead] ^ (y >> one) ^ (odd & np.uint32(0x9908B0DF))
+
+
+@compiled
+def uniform(seed, out):  # type: ignore[no-untyped-def]
+    """Fills ``out`` (N,), float32, with the first numbers in [0, 1) of torch's CPU generator.
+
+    Matsumoto and Nishimura's twister MT19937, doi:10.1145/272991.272995, with 24 bits of each word.
+    """
+    size, middle = 624, 397
+    state = np.empty(size + 1, np.uint32)  # the first word again at the end
+    state[0] = seed
+    for k in range(1, size):
+        last = state[k - 1] ^ (state[k - 1] >> np.uint32(30))
+        state[k] = np.uint32(1812433253) * last + np.uint32(k)
+    for start in range(0, out.shape[0], size):
+        _twist(state, 0, size - middle, middle)
+        state[size] = state[0]
+        _twist(state, size - middle, size, middle - size)
+        for k in range(min(size, out.shape[0] - start)):
+            y = state[k]
+            y ^= y >> np.uint32(11)
+            y ^= (y << np.uint32(7)) & np.uint32(0x9D2C5680)
+            y ^= (y << np.uint32(15)) & np.uint32(0xEFC60000)
+            y ^= y >> np.uint32(18)
+            out[start + k] = np.float32(y & np.uint32(0xFFFFFF)) * np.float32(2.0**-24)
+
+
 @compiled
 def nearest_rows(edges, along, shake, sizes, rows, delta):  # type: ignore[no-untyped-def]
     """Fills ``rows`` (R, B) of the cells between ``edges`` (3, R, B+1) and the lengths ``delta``.

@@ -217,3 +217,12 @@ def test_a_whole_step(space: Space) -> None:
         assert float(off) < 1e-2, name  # a unit near zero may be on in one and off in the other
     for one, other in zip(view, same_view, strict=True):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", [0, 7, 64 * 1_000_003, 2**40 + 7])
+@pytest.mark.parametrize("count", [1, 15, 624, 625, 50_000])
+def test_the_first_numbers_are_those_of_torch(seed: int, count: int) -> None:
+    """In however many calls torch draws them; a generator that has drawn gives its first ones again."""
+    generator = source(seed)
+    want = torch.cat([torch.rand(n, generator=generator) for n in (count // 3, count - count // 3)])
+    assert torch.equal(fused.first_uniform(generator, count), want)

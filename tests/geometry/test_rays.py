@@ -7,7 +7,13 @@ import math
 import pytest
 import torch
 
-from pipeline.geometry.rays import pixel_rays, project, undistort
+from pipeline.geometry.rays import (
+    _by_tensors,
+    _in_one_pass,
+    pixel_rays,
+    project,
+    undistort,
+)
 
 
 def a_camera() -> torch.Tensor:
@@ -56,3 +62,21 @@ def test_undistorting_undoes_the_distortion() -> None:
     x, y = undistort(u * gain, 0.3 * gain, k1)
     torch.testing.assert_close(x, u, atol=1e-6, rtol=0)
     torch.testing.assert_close(y, torch.full_like(u, 0.3), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("many", [True, False])
+@pytest.mark.parametrize("distorted", [True, False])
+def test_rays_made_in_one_pass_are_those_of_tensor_operations(many: bool, distorted: bool) -> None:
+    """To the last bit: fits hang on it."""
+    generator = torch.Generator().manual_seed(0)
+    for count in (1, 3, 1000):
+        size = (count,) if many else ()
+        columns, rows = (torch.randint(0, 800, (count,), generator=generator) for _ in range(2))
+        cameras = torch.rand(*size, 5, generator=generator) * torch.tensor(
+            [500, 500, 400, 300, 0.4]
+        )
+        cameras = cameras + torch.tensor([300, 300, 100, 100, -0.2])
+        poses = torch.randn(*size, 3, 4, generator=generator)
+        told = columns, rows, cameras, poses, distorted
+        for one, other in zip(_in_one_pass(*told), _by_tensors(*told), strict=True):
+            assert torch.equal(one, other)
