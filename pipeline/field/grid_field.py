@@ -154,16 +154,15 @@ class GridField(nn.Module):
         return self.config.samples
 
     def _noise(self, rays: Rays, generator: torch.Generator) -> Noise:
-        count, bins, near = rays.near.shape[0], self.config.bins, rays.near
-        samples = self.config.samples
+        count, bins, samples = rays.near.shape[0], self.config.bins, self.config.samples
+        sizes = [count * bins, 3 * count * bins, count * samples]
         if self._fused(rays):
-            drawn = fused.first_uniform(generator, count * (4 * bins + samples))
-            parts = drawn.split([count * bins, 3 * count * bins, count * samples])
-            shares = in_strata(parts[2].view(count, samples))
-            return Noise(parts[0].view(count, bins), parts[1].view(3, count, bins), shares)
-        along = torch.rand(count, bins, generator=generator, device=near.device)
-        shake = torch.rand(3, count, bins, generator=generator, device=near.device)
-        return Noise(along, shake, stratified(count, samples, generator, near))
+            drawn = fused.first_uniform(generator, sum(sizes))
+        else:
+            drawn = torch.rand(sum(sizes), generator=generator, device=rays.near.device)
+        along, shake, share = drawn.split(sizes)
+        shares = in_strata(share.view(count, samples))
+        return Noise(along.view(count, bins), shake.view(3, count, bins), shares)
 
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""

@@ -209,8 +209,10 @@ def test_copies_have_the_rows_stages_and_a_fits_machine_code() -> None:
     code = (
         "import sys; from experiments.tables import loaded; "
         "from pipeline.field import adam, kernels, table_kernels as rows; "
+        "from pipeline.geometry import rays; "
         "assert all(f'stages.{name}' in sys.modules for name in loaded.STAGES); "
-        "fetched = (adam._stepped, kernels.walk, rows.read_rows, rows.add_rows); "
+        "fetched = (adam._stepped, kernels.walk, kernels.uniform, rows.read_rows, rows.add_rows, "
+        "rays._fill_rays); "
         "assert all(one.signatures for one in fetched); "
         "before = [list(one.signatures) for one in fetched]; loaded._tiny(); "
         "assert before == [list(one.signatures) for one in fetched]"
