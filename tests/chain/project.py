@@ -73,6 +73,14 @@ def set_param(root: Path, section: str, key: str, value: Any) -> None:
     file.write_text(text)
 
 
+def set_scene_param(root: Path, section: str, key: str, value: Any) -> None:
+    """Changes one of the scene's own values in params.yaml."""
+    text = YAML()
+    params = text.load(root / "params.yaml")
+    params["scenes"][SCENE][section][key] = value
+    text.dump(params, root / "params.yaml")
+
+
 def photograph(folder: Path) -> None:
     """Walls of brick from nine places, as photos through drops on the lens, with their truth."""
     cams = {}

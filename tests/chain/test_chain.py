@@ -137,6 +137,10 @@ def test_a_changed_threshold_reruns_masks_and_what_follows_and_back_runs_nothing
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's help is Linux's")
 def test_a_killed_repro_takes_its_stage_along(clone: Clone) -> None:
+    """The fit has hours to go when DVC is killed: a stage that is all but done may end by itself."""
+    params = clone.root / "params.yaml"
+    before = params.read_text()
+    project.set_scene_param(clone.root, "nerf", "steps", 1_000_000)
     lock = filelock.FileLock(clone.root / f"artifacts/.work/{SCENE}/nerf/lock")
 
     def until(running: bool) -> None:
@@ -158,6 +162,7 @@ def test_a_killed_repro_takes_its_stage_along(clone: Clone) -> None:
     process.wait()
     until(running=False)
     assert not (clone.root / f"artifacts/{SCENE}/nerf").exists()
+    params.write_text(before)
     assert project.ran(project.dvc(clone.root, "repro")) == []
     assert project.fingerprints(clone.root) == clone.files
 
