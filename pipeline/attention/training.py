@@ -21,6 +21,7 @@ from pipeline.attention.unet import DropUNet
 from pipeline.attention.weights import Detector
 from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
+from pipeline.io.processor import multiplies_bfloat16
 
 THETA = 0.8
 # Columns of the validation curve; see `curve_rows`.
@@ -87,8 +88,8 @@ class Trainer:
 
     Every crop is drawn from a generator seeded with (seed, phase, iteration), so a fit that was
     interrupted and goes on from `state()` ends like one that was not. bfloat16: products in half
-    precision, about twice as fast where the processor knows it. on_device: all pictures are kept where the
-    network computes and crops are cut there, so that a GPU need not wait for them.
+    precision, about twice as fast, where the device multiplies them itself. on_device: all pictures are
+    kept where the network computes and crops are cut there, so that a GPU need not wait for them.
     """
 
     def __init__(
@@ -98,7 +99,8 @@ class Trainer:
     ) -> None:  # fmt: skip
         self.network, self.pools, self.phases = network, pools, phases
         self.stacks = resident(pools, str(_device(network))) if on_device else []
-        self.seed, self.bfloat16 = seed, bfloat16
+        self.seed = seed
+        self.bfloat16 = bfloat16 and multiplies_bfloat16(_device(network).type)
         self.clean_share, self.lures = clean_share, lures
         self.phase = self.iteration = self.seen = self.done = 0
         self.average = copy.deepcopy(network).eval()

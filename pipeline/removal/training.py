@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
+from pipeline.io.processor import multiplies_bfloat16
 from pipeline.removal.critics import Critic
 from pipeline.removal.recipes import AnyRecipe, Outcome, check_crop, critic_of
 from pipeline.removal.samples import Batch, Pairs, draw_batch, draw_resident
@@ -75,7 +76,7 @@ class Trainer:
     Every batch, and what dropout leaves out, is drawn from generators seeded with (seed, phase,
     iteration), so a fit that was interrupted and goes on from `state()` ends like one that was not.
     single_share: of the iterations with clips, how many look at five times as many single pictures
-    instead. bfloat16: products in half precision, about twice as fast where the processor knows it.
+    instead. bfloat16: products in half precision, about twice as fast, where the device multiplies them itself.
     on_device: all pictures are kept where the recipe computes, and crops are cut there.
     """
 
@@ -89,7 +90,8 @@ class Trainer:
         where = str(_device(recipe)) if on_device else None
         self.stacks = [resident(pools, where) for pools in (pairs, clips)] if where else []
         self.plan, self.phases, self.seed = plan, plan.phases, seed
-        self.bfloat16, self.single_share, self.perceptual = bfloat16, single_share, perceptual
+        self.bfloat16 = bfloat16 and multiplies_bfloat16(_device(recipe).type)
+        self.single_share, self.perceptual = single_share, perceptual
         self.critic = critic_of(recipe, seed) if plan.adversarial > 0 else None
         self.phase = self.iteration = self.done = 0
         self.average = copy.deepcopy(recipe).eval()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.attention import training
 from pipeline.attention.inference import attend
 from pipeline.attention.muon import orthogonalised
 from pipeline.attention.network import AttentiveRecurrentNet
@@ -176,14 +177,26 @@ def test_a_fit_that_broke_down_ends_with_a_sentence() -> None:
         fit(trainer, 5, {}, lambda *_: None)
 
 
-def test_half_precision_trains_too() -> None:
+def _two_steps(bfloat16: bool) -> tuple[list[float], Trainer]:
     network = DropUNet()
     network.initialise(0)
     phases = [Phase(1, 2, 2, 32, 0.02)]
-    trainer = Trainer(network, [_pool()], phases, seed=1, clean_share=0.1, bfloat16=True)
-    losses = [trainer.advance(), trainer.advance()]
-    assert np.isfinite(losses).all()
+    trainer = Trainer(network, [_pool()], phases, seed=1, clean_share=0.1, bfloat16=bfloat16)
+    return [trainer.advance(), trainer.advance()], trainer
+
+
+def test_half_precision_trains_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "multiplies_bfloat16", lambda device: True)
+    losses, trainer = _two_steps(bfloat16=True)
+    assert np.isfinite(losses).all() and losses != _two_steps(bfloat16=False)[0]
     assert all(p.dtype == torch.float32 for p in trainer.average.parameters())
+
+
+def test_a_processor_without_half_precision_trains_in_float32(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(training, "multiplies_bfloat16", lambda device: False)
+    assert _two_steps(bfloat16=True)[0] == _two_steps(bfloat16=False)[0]
 
 
 def test_score_of_a_network_that_marks_everything() -> None:
