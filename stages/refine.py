@@ -39,6 +39,7 @@ class Params(Section):
     steps: Annotated[int, Field(ge=1)]
     batch_rays: Annotated[int, Field(ge=64, le=65536)]
     shards: Annotated[int, Field(ge=1, le=64)]
+    rate: Annotated[float, Field(gt=0, le=10)]
     quantile: Annotated[float, Field(ge=0, le=1)]
     window: Annotated[int, Field(ge=0)] | Literal["auto"]
     witnesses: Annotated[int, Field(ge=0)]
@@ -82,8 +83,7 @@ def main(job: Job, params: Params) -> str:
             if one.redrawn is not None:
                 write_map(fresh / f"rounds/{number}/residual.exr", one.redrawn.gathered)
         write_drop_masks(fresh, names, done.rounds[-1].drop_masks)
-        told = account(done, names)
-        write_json(fresh / "refine.json", told)
+        write_json(fresh / "refine.json", told := account(done, names))
     rounds = "1 round" if len(done.rounds) == 2 else f"{len(done.rounds) - 1} rounds"
     return f"{rounds}, {100 * told['mean_coverage']:.1f} % masked, {told['why']}"
 
@@ -93,8 +93,8 @@ def _look(
 ) -> list[np.ndarray | None]:
     """The residuals of the fitted images after a further fit; None for the held-out ones."""
     drops = {i.record.name: mask for i, mask in zip(field.images, drop_masks, strict=True)}
-    number, rays = len(field.psnr), params.batch_rays
-    field.fit(drops, params.steps if number else params.first_steps, rays, cores(), params.shards)
+    steps = params.steps if (number := len(field.psnr)) else params.first_steps
+    field.fit(drops, steps, params.batch_rays, cores(), params.shards, params.rate)
 
     def looked(image: PosedImage) -> tuple[np.ndarray, np.ndarray]:
         """Depth and residual of a view. Its picture is let go: of hundreds it would fill the memory."""

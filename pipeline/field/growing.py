@@ -71,10 +71,11 @@ class GrowingField:
         batch_rays: int,
         threads: int,
         shards: int = 2,
+        rate: float = 1.0,
     ) -> None:
         """Fits the images that are not held out, without the pixels of `drop_masks` (by name).
 
-        `shards` and `threads` as in :func:`pipeline.field.fit.fit`.
+        `shards`, `threads` and `rate` as in :func:`pipeline.field.fit.fit`.
         """
         images = [replace(image, keep_mask=~drop_masks[image.record.name]) for image in self.images]
         seed = self.seed + len(self.psnr)
@@ -89,6 +90,7 @@ class GrowingField:
                 steps=steps,
                 batch_rays=batch_rays,
                 seed=seed,
+                rate=rate,
                 shards=shards,
                 threads=threads,
                 progress=show,
