@@ -203,7 +203,7 @@ def _pool(threads: int) -> Iterator[Executor | None]:
     """Threads for the shards, one core each: torch's own threads lose on work this small.
 
     In them numbers too small to be normal are zero. What Adam knows of a row that no ray meets any more
-    shrinks with every step and would stay there, where processors take a hundred cycles a number.
+    shrinks with every step and would stay there, where processors take many times as long for a number.
     """
     before, tiny = torch.get_num_threads(), _keeps_tiny()
     torch.set_num_threads(1)

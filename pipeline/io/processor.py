@@ -8,7 +8,7 @@ from llvmlite.binding import get_host_cpu_features
 def multiplies_bfloat16(device: str = "cpu") -> bool:
     """Whether a device, cpu or cuda, has instructions for products of bfloat16 numbers.
 
-    Without them such products take ten times as long as float32's, not half.
+    Without them such products take five times as long as float32's, not half.
     """
     if device != "cpu":
         return True

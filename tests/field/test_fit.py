@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -233,6 +234,28 @@ def test_products_are_of_the_precision_asked_for(
     assert model.config.half is half
     record = fit(model, RayBuffer(photos, 0), steps=30, batch_rays=256, seed=0, log_every=10)
     assert record.rows[-1][2] > record.rows[0][2] + 0.5
+
+
+def _keeps_tiny() -> bool:
+    return bool(torch.full((1,), 1e-39).mul(1.0) > 0.0)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_numbers_too_small_to_be_normal_are_zero_in_a_fit_alone(
+    photos: list[PosedPhoto], threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not torch.set_flush_denormal(True):
+        pytest.skip("this processor keeps them")
+    torch.set_flush_denormal(False)
+    kept, loss = list[bool](), GridField.loss
+
+    def watched(*args: Any, **how: Any) -> Any:
+        kept.append(_keeps_tiny())
+        return loss(*args, **how)
+
+    monkeypatch.setattr(GridField, "loss", watched)
+    fit(field(photos), RayBuffer(photos, 0), steps=2, batch_rays=64, seed=0, threads=threads)
+    assert kept == [False] * 4 and _keeps_tiny()
 
 
 @pytest.mark.parametrize("as_table", [False, True])
