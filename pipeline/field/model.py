@@ -114,7 +114,7 @@ def half_is_fast(model: str, device: str) -> bool:
     its step, and converting costs more. The paper's, all products, on a GPU alone.
     """
     if model == "paper":
-        return device != "cpu" and torch.cuda.get_device_capability(device) >= (8, 0)
+        return device != "cpu" and multiplies_bfloat16(device)
     return device == "cpu" and multiplies_bfloat16()
 
 

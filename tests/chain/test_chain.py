@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -141,28 +142,19 @@ def test_a_killed_repro_takes_its_stage_along(clone: Clone) -> None:
     params = clone.root / "params.yaml"
     before = params.read_text()
     project.set_scene_param(clone.root, "nerf", "steps", 1_000_000)
-    lock = filelock.FileLock(clone.root / f"artifacts/.work/{SCENE}/nerf/lock")
-
-    def until(running: bool) -> None:
-        for _ in range(6000):
-            try:
-                lock.acquire(timeout=0)
-                lock.release()
-                held = False
-            except filelock.Timeout:
-                held = True
-            if held == running:
-                return
-            time.sleep(0.01)
-        raise AssertionError("a minute has passed")
-
+    work = clone.root / f"artifacts/.work/{SCENE}/nerf"
+    (work / "log.txt").unlink()  # begun anew by the stage that holds the lock
     process = project.start_dvc(clone.root, "repro", "--force", "--single-item", f"nerf@{SCENE}")
-    until(running=True)
+    for _ in range(6000):
+        if (work / "log.txt").exists():
+            break
+        time.sleep(0.01)
     process.kill()
-    process.wait()
-    until(running=False)
-    assert not (clone.root / f"artifacts/{SCENE}/nerf").exists()
     params.write_text(before)
+    assert process.wait() == -signal.SIGKILL and (work / "log.txt").exists()
+    with filelock.FileLock(work / "lock", timeout=60):  # a minute for the stage to notice
+        pass
+    assert not (clone.root / f"artifacts/{SCENE}/nerf").exists()
     assert project.ran(project.dvc(clone.root, "repro")) == []
     assert project.fingerprints(clone.root) == clone.files
 

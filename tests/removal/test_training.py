@@ -16,7 +16,7 @@ from pipeline.attention.training import attention_loss
 from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
 from pipeline.io.tensors import save_tensors
-from pipeline.removal import clips
+from pipeline.removal import clips, training
 from pipeline.removal.autoencoder import Scales, multi_scale_loss
 from pipeline.removal.critics import AttentiveCritic, PatchCritic, Verdict
 from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, wen_loss
@@ -423,3 +423,16 @@ def test_numbers_out_of_range_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=r"lie in|is 0 or more"):
             Plan(betas, adversarial, 1e-4, given)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_half_precision_where_the_processor_has_it(
+    known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Elsewhere it would be slower: the steps are those of float32."""
+    monkeypatch.setattr(training, "multiplies_bfloat16", lambda device: known)
+    exact, half = (
+        Trainer(recipe("quan"), [pictures()], [], plan("pairs"), seed=0, bfloat16=wish).advance()
+        for wish in (False, True)
+    )
+    assert (exact != half) is known
