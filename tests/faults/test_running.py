@@ -98,9 +98,8 @@ def test_stopped_while_writing(whole: Workshop, how: signal.Signals, code: int, 
 
 def test_a_killed_fit_goes_on_where_it_was_and_ends_with_the_same_bytes(whole: Workshop) -> None:
     taken = _without(whole, "nerf")
-    whole.set(
-        "nerf", save_every=1
-    )  # the fit has much to write when it is killed: it shall not end before
+    # The fit has much to write when it is killed: it shall not end before.
+    whole.set("nerf", save_every=1)
     checkpoint = whole.root / f"artifacts/.work/{SCENE}/nerf/checkpoint.safetensors"
     code, _ = _stop_when(_start(whole, "nerf"), checkpoint.exists, signal.SIGKILL)
     assert code == -signal.SIGKILL
