@@ -30,6 +30,7 @@ __all__ = ["Job", "Section", "run"]
 USER_FAULT = 2
 INTERRUPTED = 130
 TERMINATED = 143
+PATIENCE = 10.0  # seconds for a stage that was told to end
 CHECKOUT = Path(__file__).resolve().parents[1]
 
 P = TypeVar("P", bound=Section)
@@ -255,7 +256,14 @@ def _log_to(path: Path, verbose: bool) -> None:
 
 
 def _terminate(signum: int, frame: FrameType | None) -> NoReturn:
-    """Leaves through `finally`, so that temporary folders are removed."""
+    """Leaves through `finally`, so that temporary folders are removed.
+
+    Asks again while the process lives: what is raised within a callback from C, as while numba loads a
+    kernel's machine code, is printed there and forgotten.
+    """
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _terminate)
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE)
     sys.exit(TERMINATED)
 
 

@@ -96,6 +96,37 @@ def test_stopped_while_writing(whole: Workshop, how: signal.Signals, code: int, 
     assert not list(whole.artifacts.glob(".*tmp-*"))
 
 
+DEAF_ONCE = """
+import ctypes, os, signal, time
+import pipeline.stage
+from stages.masks import Params
+
+def main(job, params):
+    kill = ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        kill()  # the exception that this makes ends within the callback, and is forgotten
+        print("still here", flush=True)
+        time.sleep(600)
+    finally:
+        print("cleaned up", flush=True)
+
+pipeline.stage.PATIENCE = 0.2
+pipeline.stage.run("masks", Params, main)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no timers")
+def test_a_stage_told_to_end_in_a_callback_from_c_is_told_again(whole: Workshop) -> None:
+    params = ["--scene", SCENE, "--params", str(whole.root / "params.yaml")]
+    done = subprocess.run(
+        [sys.executable, "-c", DEAF_ONCE, *params],
+        cwd=project.ROOT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert "ctypes callback" in done.stderr
+    assert done.stdout.split("\n") == ["still here", "cleaned up", ""]
+    assert done.returncode == 143
+
+
 def test_a_killed_fit_goes_on_where_it_was_and_ends_with_the_same_bytes(whole: Workshop) -> None:
     taken = _without(whole, "nerf")
     # The fit has much to write when it is killed: it shall not end before.
