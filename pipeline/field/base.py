@@ -52,8 +52,9 @@ class TableGradient(Protocol):
 class Part:
     """Parameters that are stepped together, with Adam's settings for them.
 
-    ``rate`` falls exponentially to ``rate * final`` over the fit, after ``warmup`` steps. Every step
-    shrinks the parameters by ``decay`` times the rate (AdamW, arXiv:1711.05101).
+    ``rate`` falls exponentially to ``rate * final`` over the fit, after ``warmup`` steps or a twentieth
+    of the fit: a short one has no more to lose. Every step shrinks the parameters by ``decay`` times the
+    rate (AdamW, arXiv:1711.05101).
     """
 
     name: str

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 FAR_FACTOR = 2.0  # the world ends this far beyond the farthest sparse point
 ALIGN_RAYS = 1024  # per step of the fits that cameras are aligned to
 ALIGN_FIELD: dict[str, Any] = {"distortion": 0.002, "decay": 0.1}  # as the final fit has them
-ALIGN_STEPS = 2  # of each camera between two fits
+ALIGN_STEPS = 1  # of each camera between two fits: a second one is as little as what the fits leave
 
 Each = Callable[[Callable[..., Any], Mapping[str, tuple[Any, ...]]], dict[str, Any]]
 

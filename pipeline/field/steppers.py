@@ -47,7 +47,8 @@ class Stepper:
     def rate_at(self, step: int) -> float:
         """The rate of a step."""
         rate = self.rate * self.part.final ** (step / self.steps)
-        return rate * min(1.0, (step + 1) / self.part.warmup) if self.part.warmup else rate
+        warmup = min(self.part.warmup, self.steps // 20)
+        return rate * min(1.0, (step + 1) / warmup) if warmup else rate
 
     def step(self, step: int, gradients: Sequence[Tensor | None]) -> None:
         """One step with the given gradients; what has none stays as it is."""

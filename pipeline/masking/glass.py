@@ -19,6 +19,7 @@ from pipeline.geometry.compiled import compiled
 from pipeline.geometry.poses import invert
 from pipeline.geometry.rays import pixel_rays
 from pipeline.geometry.spaces import mean_camera
+from pipeline.masking.agreement import Tally
 
 MAX_CELLS = 1_000_000
 BAND = 64  # rows of cells whose quantile over the views is taken at a time
@@ -115,15 +116,26 @@ class PaneGlass:
 
     def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
         """See :class:`Glass`."""
+        x, y = np.empty((2, *self.shape), np.float32)
+        _places(*self._way(view), x, y)
+        return _sample(values, x, y)
+
+    def tally(self, maps: Sequence[np.ndarray]) -> Tally:
+        """What the views' maps say of each cell, a map for each view."""
+        tally = Tally(*np.zeros((3, *self.shape)))
+        for view, values in enumerate(maps):
+            _add_view(*self._way(view), np.ascontiguousarray(values, np.float32), *tally)
+        return tally
+
+    def _way(self, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int, int]:
+        """From the cells to a view's pixels, as `_place` takes it."""
         camera = self.cameras[view]
         fx, fy, cx, cy, k1 = camera.intrinsics
         across = (self.low[0] + (np.arange(self.shape[1]) + 0.5) * self.cell).astype(np.float32)
         down = (self.low[1] + (np.arange(self.shape[0]) + 0.5) * self.cell).astype(np.float32)
         matrix = np.vstack([self.view_from_glass(view), self.normal]).astype(np.float32)
         lens = np.array([fx, fy, cx - 0.5, cy - 0.5, k1], np.float32)
-        x, y = np.empty((2, *self.shape), np.float32)
-        _places(across, down, matrix, lens, camera.width, camera.height, x, y)
-        return _sample(values, x, y)
+        return across, down, matrix, lens, camera.width, camera.height
 
     def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
         """See :class:`Glass`."""
@@ -233,27 +245,54 @@ def _directions(
 
 
 @compiled
-def _places(across, down, matrix, lens, width, height, x, y):  # type: ignore[no-untyped-def]
-    """Fills ``x`` and ``y`` (R, C) with the pixels at which a view shows the cells.
+def _place(u, v, matrix, lens, width, height):  # type: ignore[no-untyped-def]
+    """The pixel (x, y) at which a view shows a cell that the mean camera sees at ``u``, ``v``.
 
-    ``across`` (C,) and ``down`` (R,) are cells as the mean camera sees them; ``matrix`` (4, 3) leads from there
-    to the view, its last row to the mean camera's depth; ``lens``: fx, fy, cx - 0.5, cy - 0.5, k1; float32.
-    A cell that the view does not look at lies far off.
+    ``matrix`` (4, 3) leads from there to the view, its last row to the mean camera's depth; ``lens``: fx, fy,
+    cx - 0.5, cy - 0.5, k1; float32. A cell that the view does not look at lies far off.
     """
     fx, fy, cx, cy, k1 = lens
     one, nowhere = np.float32(1.0), np.float32(-1e6)
+    z = matrix[2, 0] * u + (matrix[2, 1] * v + matrix[2, 2])
+    front = matrix[3, 0] * u + (matrix[3, 1] * v + matrix[3, 2])
+    s = (matrix[0, 0] * u + (matrix[0, 1] * v + matrix[0, 2])) / z
+    t = (matrix[1, 0] * u + (matrix[1, 1] * v + matrix[1, 2])) / z
+    gain = one + k1 * (s * s + t * t)
+    # Far outside its frame a lens with k1 < 0 folds points back into it.
+    framed = abs(s) * fx < width and abs(t) * fy < height
+    return fx * s * gain + cx if z > 0 and front > 0 and framed else nowhere, fy * t * gain + cy
+
+
+@compiled
+def _places(across, down, matrix, lens, width, height, x, y):  # type: ignore[no-untyped-def]
+    """Fills ``x`` and ``y`` (R, C) with the pixels of the cells at ``down`` (R,) and ``across`` (C,)."""
     for row in range(down.size):
         for column in range(across.size):
             u, v = across[column], down[row]
-            z = matrix[2, 0] * u + (matrix[2, 1] * v + matrix[2, 2])
-            front = matrix[3, 0] * u + (matrix[3, 1] * v + matrix[3, 2])
-            s = (matrix[0, 0] * u + (matrix[0, 1] * v + matrix[0, 2])) / z
-            t = (matrix[1, 0] * u + (matrix[1, 1] * v + matrix[1, 2])) / z
-            gain = one + k1 * (s * s + t * t)
-            # Far outside its frame a lens with k1 < 0 folds points back into it.
-            framed = abs(s) * fx < width and abs(t) * fy < height
-            x[row, column] = fx * s * gain + cx if z > 0 and front > 0 and framed else nowhere
-            y[row, column] = fy * t * gain + cy
+            x[row, column], y[row, column] = _place(u, v, matrix, lens, width, height)
+
+
+@compiled
+def _add_view(across, down, matrix, lens, width, height, values, votes, total, squares):  # type: ignore[no-untyped-def]
+    """Adds to a tally of the cells what a view's map ``values`` says of those that it sees."""
+    rows, columns = values.shape
+    right, bottom = np.float32(columns - 0.5), np.float32(rows - 0.5)
+    for row in range(down.size):
+        for column in range(across.size):
+            x, y = _place(across[column], down[row], matrix, lens, width, height)
+            if not (x >= -0.5 and x <= right and y >= -0.5 and y <= bottom):
+                continue
+            x, y = max(x, np.float32(0.0)), max(y, np.float32(0.0))
+            left, top = min(int(x), columns - 1), min(int(y), rows - 1)
+            after, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
+            s, t = x - np.float32(left), y - np.float32(top)
+            high = values[top, left] + s * (values[top, after] - values[top, left])
+            low = values[below, left] + s * (values[below, after] - values[below, left])
+            seen = np.float64(high + t * (low - high))
+            if seen == seen:  # not NaN
+                votes[row, column] += 1.0
+                total[row, column] += seen
+                squares[row, column] += seen * seen
 
 
 def _sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

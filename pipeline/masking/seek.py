@@ -7,9 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.masking.agreement import agreement
 from pipeline.masking.align import aligned
 from pipeline.masking.glass import Glass, GlassCamera, LensGlass, PaneGlass
-from pipeline.masking.sweep import Found, agreement, agreement_on, find_glass
+from pipeline.masking.sweep import Found, agreement_on, find_glass
 
 Wish = Literal["auto", "lens", "pane"]
 OFF = 25  # the longer side over this: how far poses may put a view off on the pane

@@ -10,26 +10,32 @@ import numpy as np
 from scipy.optimize import minimize
 
 from pipeline.geometry.poses import centre
+from pipeline.masking.agreement import FEWEST_VIEWS, agreement, correlation
 from pipeline.masking.glass import Glass, GlassCamera, LensGlass, PaneGlass, pane_before
 
 Mode = Literal["lens", "pane", "none"]
+Plane = tuple[float, float, float]  # distance, tilt x and tilt y in degrees
+Scored = tuple[float, Plane]  # agreement on a plane
 
 COARSE, FINE = 72, 200  # longest side of the maps, for the sweep and for its refinement
-FEWEST_VIEWS = 3  # that see a cell which counts
 FEWEST_CELLS = 0.15  # of the maps' pixels: a plane on which less is shared tells nothing
 TILTS_DEG = (-30.0, -15.0, 0.0, 15.0, 30.0)
 MOST_TILT_DEG = 45.0
 STEP_PX = 2.0  # between neighbouring distances, at the coarse size
 MOST_VIEWS = 32  # that are swept
-STARTS = 3  # of the sweep's best planes that are refined
+STARTS = 3  # of the sweep's best planes that are refined, at the coarse size
+NEAR = 0.02  # of the best plane's agreement, at the coarse size: planes that are refined further with it
+AHEAD = 0.1  # of the lens's agreement before every plane's, at the coarse size: no plane is refined further
+# Of a refinement: the first steps (share of the distance, degrees), and how many planes are tried.
+COARSE_WAY, FINE_WAY = (0.04, 7.0, 60), (0.01, 2.0, 40)
 
 
 class Found(NamedTuple):
     """Where the glass is, and how well the views agree there, at most 1.
 
     `pane_from_world` (4, 4), `distance` (world units, along the mean camera's axis) and the tilts in
-    degrees (see `pane_before`) describe the best plane, whether or not it was chosen; None when
-    there was none to try.
+    degrees (see `pane_before`) describe the best plane, whether or not it was chosen (found at the coarse
+    size alone where the lens is far ahead); None when there was none to try.
     """
 
     mode: Mode
@@ -39,35 +45,6 @@ class Found(NamedTuple):
     distance: float
     tilt_x_deg: float
     tilt_y_deg: float
-
-
-def agreement(stack: np.ndarray, fewest_views: int = FEWEST_VIEWS) -> float:
-    """How alike the views' values are in the same cell: the intraclass correlation of (V, ...).
-
-    One-way analysis of variance with cells as groups: 1 when the views agree wholly, near 0 when a
-    cell says nothing about its values, whatever the number of views per cell. Cells that fewer
-    than `fewest_views` see (NaN: does not see) do not count. 0 when nothing varies or too little is
-    shared.
-    """
-    flat = stack.reshape(len(stack), -1)
-    seen = ~np.isnan(flat)
-    count = seen.sum(axis=0)
-    shared = count >= fewest_views
-    values = flat[:, shared].astype(np.result_type(flat, np.float32), copy=False)  # the stack stays
-    seen, count = seen[:, shared], count[shared].astype(np.float64)
-    if count.size < 2:
-        return 0.0
-    values[~seen] = 0
-    total = count.sum()
-    mean = values.sum(axis=0, dtype=np.float64) / count
-    grand = (mean * count).sum() / total
-    between = (count * (mean - grand) ** 2).sum() / (count.size - 1)
-    values -= mean.astype(values.dtype)
-    values[~seen] = 0
-    within = np.square(values, out=values).sum(dtype=np.float64) / (total - count.size)
-    per_cell = (total - (count**2).sum() / total) / (count.size - 1)
-    whole = between + (per_cell - 1) * within
-    return float((between - within) / whole) if whole > 0 else 0.0
 
 
 def find_glass(
@@ -81,7 +58,7 @@ def find_glass(
     """Which glass the maps (attention, or residual) were taken through: lens, pane in the scene, none.
 
     Every pane distance up to `farthest` is tried, upright and tilted; where the maps agree best, the
-    plane is refined. The glass that moves with the camera is one more candidate. A mode is chosen
+    plane is refined, unless the lens is far ahead. The glass that moves with the camera is one more candidate. A mode is chosen
     when its agreement reaches `at_least`. `start`: (distance, tilt x, tilt y in degrees), found
     before; only its neighbourhood is searched then. Broad gradients (sky above, ground below) agree on
     any glass and are taken out first. Maps that hold NaN have no vote there.
@@ -90,25 +67,25 @@ def find_glass(
         np.linspace(0, len(maps) - 1, min(len(maps), MOST_VIEWS)).round().astype(int)
     )
     maps, cameras = [maps[i] for i in chosen], [cameras[i] for i in chosen]
-    coarse, coarse_cameras = prepared(maps, cameras, COARSE)
-    lens = agreement(_stack(LensGlass(*coarse[0].shape), coarse))
+    coarse = prepared(maps, cameras, COARSE)
+    lens = agreement(_stack(LensGlass(*coarse[0][0].shape), coarse[0]))
     cams = np.stack([camera.cam_from_world for camera in cameras])
     if start is None:
         # Glass that moves with the camera shows: no need then to look for a tilted pane.
         tilts = (0.0,) if lens >= at_least else TILTS_DEG
-        tried = _sweep(coarse, coarse_cameras, cams, farthest, tilts)
+        tried = _sweep(*coarse, cams, farthest, tilts)
     else:
         tried = [(0.0, (float(start[0]), float(start[1]), float(start[2])))]
     if not tried:
         return Found("lens" if lens >= at_least else "none", lens, 0.0, None, 0.0, 0.0, 0.0)
-    fine, fine_cameras = prepared(maps, cameras, FINE)
-    best, plane = max(
-        (
-            _refined(place, (coarse, coarse_cameras), (fine, fine_cameras), cams, farthest)
-            for _, place in tried
-        ),
-        key=lambda found: found[0],
-    )
+    refined = [_refined(place, *coarse, cams, farthest, COARSE_WAY) for _, place in tried]
+    best, plane = max(refined)
+    if lens < at_least or best > lens - AHEAD:
+        fine = prepared(maps, cameras, FINE)
+        close = [one for one in refined if one[0] >= best - NEAR]
+        best, plane = max(
+            _refined(place, *fine, cams, farthest, FINE_WAY) for _, place in _leaders(close)
+        )
     mode: Mode = "none"
     if max(lens, best) >= at_least:
         mode = "pane" if best > lens else "lens"
@@ -140,8 +117,8 @@ def _sweep(
     cams: np.ndarray,
     farthest: float,
     tilts: Sequence[float],
-) -> list[tuple[float, tuple[float, float, float]]]:
-    """The best few planes (agreement, plane), no two of them neighbours."""
+) -> list[Scored]:
+    """The best few planes, no two of them neighbours."""
     centres = np.stack([centre(cam) for cam in cams])
     spread = float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if spread <= 0 or len(maps) < FEWEST_VIEWS:
@@ -158,9 +135,13 @@ def _sweep(
         for b in tilts
         for distance in distances
     ]
-    scored.sort(key=lambda one: -one[0])
-    best: list[tuple[float, tuple[float, float, float]]] = []
-    for score, place in scored:
+    return _leaders(scored)
+
+
+def _leaders(scored: list[Scored]) -> list[Scored]:
+    """The best few, no two of them neighbours."""
+    best: list[Scored] = []
+    for score, place in sorted(scored, key=lambda one: -one[0]):
         if all(_apart(place, other) for _, other in best):
             best.append((score, place))
         if len(best) == STARTS:
@@ -168,7 +149,7 @@ def _sweep(
     return best
 
 
-def _apart(one: tuple[float, float, float], other: tuple[float, float, float]) -> bool:
+def _apart(one: Plane, other: Plane) -> bool:
     return (
         abs(one[0] / other[0] - 1) > 0.15
         or max(abs(one[1] - other[1]), abs(one[2] - other[2])) > 20.0
@@ -176,41 +157,35 @@ def _apart(one: tuple[float, float, float], other: tuple[float, float, float]) -
 
 
 def _refined(
-    place: tuple[float, float, float],
-    coarse: tuple[list[np.ndarray], list[GlassCamera]],
-    fine: tuple[list[np.ndarray], list[GlassCamera]],
+    place: Plane,
+    maps: list[np.ndarray],
+    cameras: list[GlassCamera],
     cams: np.ndarray,
     farthest: float,
-) -> tuple[float, tuple[float, float, float]]:
-    """The plane near `place` at which the maps agree best, coarse first and then fine."""
-    at = place
-    for (maps, cameras), (share, degrees), calls in (
-        (coarse, (0.04, 7.0), 60),
-        (fine, (0.01, 2.0), 40),
-    ):
-        simplex = np.array([(np.log(at[0]), at[1], at[2])] * 4)
-        simplex[1, 0] -= share
-        simplex[2, 1] += degrees
-        simplex[3, 2] += degrees
+    way: tuple[float, float, int],
+) -> Scored:
+    """The plane near `place` at which the maps agree best, sought by simplex on the way given."""
+    share, degrees, calls = way
+    simplex = np.array([(np.log(place[0]), place[1], place[2])] * 4)
+    simplex[1, 0] -= share
+    simplex[2, 1] += degrees
+    simplex[3, 2] += degrees
 
-        def cost(
-            x: np.ndarray, maps: list[np.ndarray] = maps, cameras: list[GlassCamera] = cameras
-        ) -> float:
-            plane = (float(np.exp(x[0])), float(x[1]), float(x[2]))
-            # Towards infinity a plane becomes glass that turns with the world: no pane.
-            return 0.0 if plane[0] > farthest else -_on_plane(maps, cameras, cams, plane)
+    def cost(x: np.ndarray) -> float:
+        plane = (float(np.exp(x[0])), float(x[1]), float(x[2]))
+        # Towards infinity a plane becomes glass that turns with the world: no pane.
+        return 0.0 if plane[0] > farthest else -_on_plane(maps, cameras, cams, plane)
 
-        options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 1e-3, "fatol": 1e-4}
-        found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
-        at = (float(np.exp(found.x[0])), float(found.x[1]), float(found.x[2]))
-    return -float(found.fun), at
+    options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 1e-3, "fatol": 1e-4}
+    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
+    return -float(found.fun), (float(np.exp(found.x[0])), float(found.x[1]), float(found.x[2]))
 
 
 def _on_plane(
     maps: list[np.ndarray],
     cameras: list[GlassCamera],
     cams: np.ndarray,
-    plane: tuple[float, float, float],
+    plane: Plane,
 ) -> float:
     if max(abs(plane[1]), abs(plane[2])) > MOST_TILT_DEG:
         return 0.0
@@ -218,9 +193,9 @@ def _on_plane(
         glass = PaneGlass(pane_before(cams, *plane), cameras, max_cells=3 * maps[0].size)
     except ValueError:
         return 0.0
-    stack = _stack(glass, maps)
-    shared = (np.isfinite(stack).sum(axis=0) >= FEWEST_VIEWS).sum()
-    return agreement(stack) if shared >= FEWEST_CELLS * maps[0].size else 0.0
+    tally = glass.tally(maps)
+    shared = (tally.votes >= FEWEST_VIEWS).sum()
+    return correlation(tally) if shared >= FEWEST_CELLS * maps[0].size else 0.0
 
 
 def _stack(glass: Glass, maps: list[np.ndarray]) -> np.ndarray:

@@ -263,7 +263,7 @@ def test_steps_are_those_of_adamw(as_table: bool) -> None:
     """With decay, and for a parameter that has no gradient in some steps; a table's gradient is cleared."""
     start = [torch.randn(7, 3, generator=torch.Generator().manual_seed(i)) for i in range(2)]
     ours, theirs = ([torch.nn.Parameter(one.clone()) for one in start] for _ in range(2))
-    part = Part("both", ("a", "b"), 1e-2, 0.1, (0.8, 0.95), 1e-9, warmup=2, decay=0.3)
+    part = Part("both", ("a", "b"), 1e-2, 0.1, (0.8, 0.95), 1e-9, decay=0.3)
     stepper = Stepper(part, ours, steps=6)
     adam = torch.optim.AdamW(theirs, betas=part.betas, eps=part.eps, weight_decay=part.decay)
     for step in range(6):
@@ -280,6 +280,18 @@ def test_steps_are_those_of_adamw(as_table: bool) -> None:
         adam.step()
     for one, other in zip(ours, theirs, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_the_rate_rises_in_the_warm_up_or_a_twentieth_of_a_short_fit_and_falls_exponentially() -> (
+    None
+):
+    part = Part("one", ("a",), 0.5, 0.01, warmup=50)
+    for steps, rising in ((2000, 50), (400, 20), (10, 0)):
+        stepper = Stepper(part, [torch.nn.Parameter(torch.ones(1))], steps, rate=2.0)
+        found = np.array([stepper.rate_at(step) for step in range(steps + 1)])
+        falling = 0.01 ** (np.arange(steps + 1) / steps)
+        rise = np.minimum(1.0, (np.arange(steps + 1) + 1) / max(rising, 1))
+        np.testing.assert_allclose(found, falling * rise, rtol=1e-12)
 
 
 def test_a_fit_does_not_load_the_compiler_of_torch() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.masking.agreement import tally_of
 from pipeline.masking.glass import (
     LensGlass,
     PaneGlass,
@@ -45,6 +46,22 @@ def test_views_agree_on_the_pane_and_get_their_map_back(tilts: tuple[float, floa
         back = glass.to_view(index, mean)
         assert np.isfinite(back).mean() > 0.98
         assert ((back > 0.5) == (own > 0.5))[np.isfinite(back)].mean() > 0.97
+
+
+def test_a_tally_is_that_of_the_views_maps_on_the_glass() -> None:
+    views = cameras(6, k1=-0.12)
+    pane = pane_before(np.stack([v.cam_from_world for v in views]), 1.5, 10, 5)
+    # Steep nowhere, so that the 32nds of a pixel in which maps are otherwise read do not show.
+    maps = [np.hypot(*np.mgrid[0 : v.height, 0 : v.width]).astype(np.float32) / 99 for v in views]
+    maps[2][20:30, 30:50] = np.nan  # has no vote there
+    glass = PaneGlass(pane, views)
+    found = glass.tally(maps)
+    stacked = tally_of(np.stack([glass.from_view(v, values) for v, values in enumerate(maps)]))
+    assert found.votes.min() == 0 and found.votes.max() == 6
+    assert (found.votes != stacked.votes).mean() < 0.005  # beside NaN at a 64th of a pixel
+    same = found.votes == stacked.votes
+    assert np.allclose(found.total[same], stacked.total[same], atol=2e-3)
+    assert np.allclose(found.squares[same], stacked.squares[same], atol=5e-3)
 
 
 def test_there_and_back_through_a_lens_with_distortion() -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.masking.sweep import agreement, find_glass
+from pipeline.masking.agreement import agreement
+from pipeline.masking.sweep import find_glass
 
 sys.path.insert(0, str(Path(__file__).parent))
 
