@@ -58,10 +58,11 @@ def find_glass(
     """Which glass the maps (attention, or residual) were taken through: lens, pane in the scene, none.
 
     Every pane distance up to `farthest` is tried, upright and tilted; where the maps agree best, the
-    plane is refined, unless the lens is far ahead. The glass that moves with the camera is one more candidate. A mode is chosen
-    when its agreement reaches `at_least`. `start`: (distance, tilt x, tilt y in degrees), found
-    before; only its neighbourhood is searched then. Broad gradients (sky above, ground below) agree on
-    any glass and are taken out first. Maps that hold NaN have no vote there.
+    plane is refined. The glass that moves with the camera is one more candidate; where it is far ahead,
+    no plane is refined at the larger size. A mode is chosen when its agreement reaches `at_least`.
+    `start`: (distance, tilt x, tilt y in degrees), found before; only its neighbourhood is searched
+    then. Broad gradients (sky above, ground below) agree on any glass and are taken out first. Maps that
+    hold NaN have no vote there.
     """
     chosen = np.unique(
         np.linspace(0, len(maps) - 1, min(len(maps), MOST_VIEWS)).round().astype(int)
