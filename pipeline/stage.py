@@ -117,6 +117,8 @@ def run(
     except KeyboardInterrupt:
         print(f"{name}: interrupted; nothing half-written is left.", file=sys.stderr)
         sys.exit(INTERRUPTED)
+    finally:
+        _ask_again_after(0.0)  # not while Python itself ends, which no longer listens
 
 
 def _by_its_name(main: Callable[..., Any]) -> Any:
@@ -261,10 +263,16 @@ def _terminate(signum: int, frame: FrameType | None) -> NoReturn:
     Asks again while the process lives: what is raised within a callback from C, as while numba loads a
     kernel's machine code, is printed there and forgotten.
     """
-    if hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGALRM, _terminate)
-        signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+    _ask_again_after(PATIENCE)
     sys.exit(TERMINATED)
+
+
+def _ask_again_after(seconds: float) -> None:
+    """Sets the clock for the next :func:`_terminate`, where there is one; 0: for none."""
+    if hasattr(signal, "setitimer"):
+        if seconds:
+            signal.signal(signal.SIGALRM, _terminate)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def _die_with_dvc() -> None:

@@ -110,7 +110,7 @@ def main(job, params):
     finally:
         print("cleaned up", flush=True)
 
-pipeline.stage.PATIENCE = 0.2
+pipeline.stage.PATIENCE = 1.0
 pipeline.stage.run("masks", Params, main)
 """
 
