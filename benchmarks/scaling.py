@@ -30,6 +30,7 @@ from pipeline.field.buffer import RayBuffer
 from pipeline.field.fit import fit
 from pipeline.field.grid_field import GridField
 from pipeline.field.render import render_view
+from pipeline.field.sampling import stratified
 
 ROOT = Path(__file__).resolve().parents[1]
 LINE = 64
@@ -88,9 +89,18 @@ def stages(settings: dict[str, Any]) -> None:
     proposed = torch.rand(rays_per_step, model.config.bins, generator=generator)
 
     def sample() -> None:
-        u = torch.rand(rays_per_step, samples, generator=generator).sort(-1).values
+        u = stratified(rays_per_step, samples, None, rays.near)
         edges = fused.drawn_edges(proposed, u)
         fused.middles(fused.walk(model.space, *rays, edges))
+
+    def guide() -> None:
+        with torch.no_grad():
+            model._propose(rays, model._bins(rays), None, None)
+
+    walls = model._bins(rays)
+
+    def teach() -> None:
+        model._propose(rays, walls, model._noise(rays, generator), [])
 
     shaped = torch.randn(rays_per_step, samples, 16).requires_grad_()
     lengths = torch.rand(rays_per_step, samples)
@@ -125,8 +135,8 @@ def stages(settings: dict[str, Any]) -> None:
     lookups = count * 8 * levels
     work = [
         ("batch of rays", lambda: buffer.batch(1, rays_per_step), 0, rays_per_step * 60),
-        ("proposal, forward", lambda: model._propose(rays, model._noise(rays, generator), []), 0,
-         rays_per_step * bins * (LINE + 40)),
+        ("proposal, to sample by", guide, 0, rays_per_step * bins * (LINE + 16)),
+        ("proposal, to teach", teach, 0, rays_per_step * bins * (LINE + 32)),
         ("samples along rays", sample, 0, count * 6 * 4),
         ("read rows", read, 0, lookups * row_bytes),
         ("add rows", add, 0, lookups * 2 * row_bytes),

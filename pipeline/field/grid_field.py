@@ -20,7 +20,6 @@ from pipeline.field.encoding import (
 from pipeline.field.losses import distortion_loss, masked_photometric_loss, proposal_loss
 from pipeline.field.sampling import (
     depth_at,
-    in_strata,
     intervals_around,
     invert_histogram,
     middles,
@@ -44,8 +43,8 @@ class GridConfig:
     fine: tuple[int, int, int] = (512, 384, 128)
     hidden: int = 64
     samples: int = 8
-    bins: int = 32
-    proposal: tuple[int, int, int] = (96, 72, 64)
+    bins: int = 24
+    proposal: tuple[int, int, int] = (64, 48, 48)
     distortion: float = 0.0
     trim: float = 0.0
     decay: float = 0.0
@@ -60,16 +59,14 @@ class Phase(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """The random numbers of a step, in [0, 1].
+    """The random numbers of a step that teaches the proposal, in [0, 1].
 
-    Where in each bin ``(R, B)`` and how far off ``(3, R, B)`` the proposal is asked, and the sorted shares
-    of its weight ``(R, S)`` at which the samples lie. Half a cell off: on average the nearest cell is the
-    trilinear mixture.
+    Where in each bin ``(R, B)`` and how far off ``(3, R, B)`` it is asked. Half a cell off: on average
+    the nearest cell is the trilinear mixture.
     """
 
     in_bin: Tensor
     shake: Tensor
-    along_weight: Tensor
 
 
 class Shaded(NamedTuple):
@@ -111,7 +108,7 @@ class GridField(nn.Module):
     def render(self, rays: Rays) -> Rendering:
         """See :class:`pipeline.field.base.Field`."""
         with torch.no_grad():
-            out = self._shade(rays, self._propose(rays, None, None), None, None)
+            out = self._shade(rays, self._propose(rays, self._bins(rays), None, None), None)
             middle = 0.5 * (out.edges[:, 1:] + out.edges[:, :-1])
             depth = depth_at((out.weights * middle).sum(-1), rays.near, rays.far)
             sigma = torch.exp(out.shape[..., 0].clamp_max(MAX_LOG_DENSITY))
@@ -128,17 +125,21 @@ class GridField(nn.Module):
         sink: list[TableGradient],
         gain: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """See :class:`pipeline.field.base.Field`."""
-        phase, noise = self.phase(step), self._noise(rays, generator)
-        with torch.set_grad_enabled(phase.learn_proposal):
-            proposed = self._propose(rays, noise, sink)
-        out = self._shade(rays, proposed.detach(), noise, sink)
+        """See :class:`pipeline.field.base.Field`.
+
+        Colours are those of :meth:`render`: samples lie where the proposal puts them, without chance.
+        """
+        phase, bins = self.phase(step), self._bins(rays)
+        with torch.no_grad():
+            guide = self._propose(rays, bins, None, None)
+        out = self._shade(rays, guide, sink)
         rgb = out.rgb if gain is None else out.rgb * gain
         photometric = masked_photometric_loss(rgb, observed, drop_mask)
         total = photometric
         if phase.trimmed:
             total = masked_photometric_loss(rgb, observed, drop_mask, self.config.trim)
         if phase.learn_proposal:
+            proposed = self._propose(rays, bins, self._noise(rays, generator), sink)
             bound = fused.proposal_loss if self._fused(rays) else proposal_loss
             total = total + bound(out.edges, out.weights, proposed)
         if self.config.distortion > 0.0:
@@ -154,15 +155,13 @@ class GridField(nn.Module):
         return self.config.samples
 
     def _noise(self, rays: Rays, generator: torch.Generator) -> Noise:
-        count, bins, samples = rays.near.shape[0], self.config.bins, self.config.samples
-        sizes = [count * bins, 3 * count * bins, count * samples]
+        count, bins = rays.near.shape[0], self.config.bins
         if self._fused(rays):
-            drawn = fused.first_uniform(generator, sum(sizes))
+            drawn = fused.first_uniform(generator, 4 * count * bins)
         else:
-            drawn = torch.rand(sum(sizes), generator=generator, device=rays.near.device)
-        along, shake, share = drawn.split(sizes)
-        shares = in_strata(share.view(count, samples))
-        return Noise(along.view(count, bins), shake.view(3, count, bins), shares)
+            drawn = torch.rand(4 * count * bins, generator=generator, device=rays.near.device)
+        drawn = drawn.view(4, count, bins)
+        return Noise(drawn[0], drawn[1:])
 
     def parts(self) -> list[Part]:
         """See :class:`pipeline.field.base.Field`."""
@@ -180,11 +179,17 @@ class GridField(nn.Module):
             Part("head", head, 1e-2, 0.03, betas, 1e-8, 50),
         ]
 
-    def _propose(self, rays: Rays, noise: Noise | None, sink: list[TableGradient] | None) -> Tensor:
-        """The proposal's weights ``(R, B)`` in equal bins of normalised depth."""
-        bins, sizes = self.config.bins, self.config.proposal
-        edges = self._walk(rays, torch.linspace(0, 1, bins + 1, device=rays.near.device)[None])
-        along, shake = (None, None) if noise is None else noise[:2]
+    def _bins(self, rays: Rays) -> Tensor:
+        """Unit-cube positions ``(3, R, B+1)`` of the edges of equal bins of normalised depth."""
+        edges = torch.linspace(0, 1, self.config.bins + 1, device=rays.near.device)
+        return self._walk(rays, edges[None])
+
+    def _propose(
+        self, rays: Rays, edges: Tensor, noise: Noise | None, sink: list[TableGradient] | None
+    ) -> Tensor:
+        """The proposal's weights ``(R, B)`` between the bins' ``edges``."""
+        sizes = self.config.proposal
+        along, shake = (None, None) if noise is None else noise
         if self._fused(rays):
             rows, delta = fused.nearest_rows(edges, along, shake, sizes)
         else:
@@ -199,12 +204,11 @@ class GridField(nn.Module):
         self,
         rays: Rays,
         proposed: Tensor,
-        noise: Noise | None,
         sink: list[TableGradient] | None,
     ) -> Shaded:
-        """Colours from samples where the proposal has its weight."""
+        """Colours from samples where the proposal has its weight: at equal shares of it."""
         count, samples = rays.near.shape[0], self.config.samples
-        u = stratified(count, samples, None, rays.near) if noise is None else noise.along_weight
+        u = stratified(count, samples, None, rays.near)
         mixed = proposed + 0.01 / self.config.bins
         if self._fused(rays):
             edges = fused.drawn_edges(mixed, u)

@@ -103,7 +103,7 @@ def grid_sizes(space: Space, fine: int) -> dict[str, tuple[int, int, int]]:
     return {
         "coarse": across(24, 16),
         "fine": across(fine, max(16, fine // 12)),
-        "proposal": across(96, 64),
+        "proposal": across(64, 48),
     }
 
 

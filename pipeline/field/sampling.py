@@ -37,16 +37,11 @@ def stratified(rays: int, count: int, generator: torch.Generator | None, like: T
 
     Random within each stratum with a generator, in its middle without one.
     """
+    strata = torch.arange(count, dtype=like.dtype, device=like.device)
     if generator is None:
-        return in_strata(like.new_full((1, count), 0.5)).expand(rays, count)
+        return ((strata + 0.5) / count).expand(rays, count)
     noise = torch.rand(rays, count, generator=generator, dtype=like.dtype, device=like.device)
-    return in_strata(noise)
-
-
-def in_strata(share: Tensor) -> Tensor:
-    """Numbers in [0, 1], each at its ``share`` ``(R, K)`` of its stratum, of K equal ones."""
-    count = share.shape[-1]
-    return (torch.arange(count, dtype=share.dtype, device=share.device) + share) / count
+    return (strata + noise) / count
 
 
 def intervals_around(s: Tensor) -> Tensor:

@@ -39,6 +39,14 @@ def some_rays() -> Rays:
     return Rays(0.2 * torch.rand(3, R, generator=g), rays_d, near, near * 8.0)
 
 
+def taught_field(config: GridConfig, space: Space) -> GridField:
+    """A field whose proposal's weights differ from bin to bin."""
+    field = GridField(config, space, 0)
+    with torch.no_grad():
+        field.proposal.copy_(4.0 * torch.randn(field.proposal.shape, generator=source(5)))
+    return field
+
+
 def both(work: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
     """The result and the gradient of a fixed mixture of it."""
     x = x.clone().requires_grad_()
@@ -198,7 +206,7 @@ def test_a_whole_step(space: Space) -> None:
     observed, none = torch.rand(R, 3, generator=source(3)), torch.zeros(R)
     results = []
     for plain in (True, False):
-        field = GridField(replace(SMALL, distortion=0.1), space, 0)
+        field = taught_field(replace(SMALL, distortion=0.1), space)
         field.plain = plain
         sink: list[TableGradient] = []
         loss, _ = field.loss(rays, observed, none, 0, source(4), sink)
@@ -217,6 +225,26 @@ def test_a_whole_step(space: Space) -> None:
         assert float(off) < 1e-2, name  # a unit near zero may be on in one and off in the other
     for one, other in zip(view, same_view, strict=True):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_what_a_step_fits_is_what_is_rendered_whatever_the_seed(plain: bool) -> None:
+    """Chance moves where the proposal learns, never where a colour is asked for."""
+    rays, observed, none = some_rays(), torch.rand(R, 3, generator=source(3)), torch.zeros(R)
+    field = taught_field(SMALL, NDC)
+    field.plain = plain
+    want = losses.masked_photometric_loss(field.render(rays).rgb, observed, none)
+    taught = []
+    for seed in (1, 2):
+        sink: list[TableGradient] = []
+        loss, photometric = field.loss(rays, observed, none, 0, source(seed), sink)
+        torch.testing.assert_close(photometric.detach(), want, atol=0, rtol=1e-6)
+        loss.backward()
+        entries = [entry for entry in sink if entry.table == "proposal"]
+        taught.append(torch.zeros_like(field.proposal))
+        for entry in entries:
+            entry.add_to(taught[-1])
+    assert not torch.equal(*taught)
 
 
 @pytest.mark.parametrize("seed", [0, 7, 64 * 1_000_003, 2**40 + 7])
