@@ -10,8 +10,8 @@ A scene is a folder with photos and `truth/` (`clean/`, `coverage/`, `cameras.js
 `refine` are read from `artifacts/<scene>/` where they exist. Every eighth view is held out and
 compared with its clean reference; settings are those of params.yaml. *clean-masked*: the clean photos
 behind the true masks, without the rainy photos' own noise and blur between the drops. *seen*: the pixels whose
-surface at least three fitted photos show without a drop, by the depth of the clean fit; the oracle
-gap is the loss against the clean photos with the same poses.
+surface at least three fitted photos show without a drop, by `truth/depth` or else by the depth of the clean
+fit; the oracle gap is the loss against the clean photos with the same poses.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import copy
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,6 +43,7 @@ from pipeline.io.transforms import View, read_transforms
 ROOT = Path(__file__).resolve().parents[1]
 # A faintly wet pixel hurts, a clean one thrown away costs: the true masks end where the water ends.
 TRUE_COVERAGE = 0.02
+SKY = 1e4  # metres: as far as a sky without a depth is taken to be
 ROWS = {
     "clean": ("clean", "none", "true"),
     "clean-masked": ("clean", "true", "true"),
@@ -79,6 +80,7 @@ class Scene:
     coverage: dict[str, np.ndarray]
     drawn: dict[str, dict[str, np.ndarray]]  # keep masks of the stages `masks` and `refine`
     views: dict[str, dict[str, View]]  # poses "true" and, if there are any, "sfm"
+    depth: dict[str, np.ndarray] = field(default_factory=dict)  # true, (H, W); 0: sky
 
 
 class Result(NamedTuple):
@@ -112,7 +114,10 @@ def load(folder: Path, artifacts: Path) -> Scene:
         for stage in ("masks", "refine")
     }
     views = {"true": _true_views(truth, list(photos), sfm)} | ({"sfm": sfm} if sfm else {})
-    return Scene(rainy, clean, coverage, drawn, views)
+    maps = {stem: truth / "depth" / f"{stem}.exr" for stem in photos}
+    known = all(path.is_file() for path in maps.values())
+    depth = {stem: read_depth(path) for stem, path in maps.items()} if known else {}
+    return Scene(rainy, clean, coverage, drawn, views, depth)
 
 
 def shrunk(scene: Scene, parts: int) -> Scene:
@@ -140,6 +145,7 @@ def shrunk(scene: Scene, parts: int) -> Scene:
             for k, v in scene.drawn.items()
         },
         {k: {s: view(one) for s, one in v.items()} for k, v in scene.views.items()},
+        {stem: depth[::parts, ::parts] for stem, depth in scene.depth.items()},
     )
 
 
@@ -160,15 +166,10 @@ def _true_views(truth: Path, stems: list[str], sfm: dict[str, View]) -> dict[str
     return {s: View(s, cam, *camera, *size, float(near), float(far)) for s, cam in cams.items()}
 
 
-def measure(
-    scene: Scene,
-    row: str,
-    settings: dict[str, Any],
-    threads: int,
-    seen: dict[str, np.ndarray],
-    device: str = "cpu",
-) -> Result:
-    """Fit one row's input and compare the held-out views; ``seen`` masks by stem, may be empty."""
+def photos_of(
+    scene: Scene, row: str, settings: dict[str, Any]
+) -> tuple[list[PosedPhoto], list[str], float, float]:
+    """The photos that one row fits, the stems that it holds out, and the depths that bound it."""
     kind, masks, poses = ROWS[row]
     views = scene.views[poses]
     near = min(view.near for view in views.values()) * settings["near_factor"]
@@ -189,14 +190,29 @@ def measure(
         photos.append(
             PosedPhoto(stem, image, keep_mask, view.cam_from_world, view.intrinsics, near, far)
         )
+    return photos, held_out, near, far
+
+
+def measure(
+    scene: Scene,
+    row: str,
+    settings: dict[str, Any],
+    threads: int,
+    seen: dict[str, np.ndarray],
+    device: str = "cpu",
+) -> Result:
+    """Fit one row's input and compare the held-out views; ``seen`` masks by stem, may be empty."""
+    photos, held_out, near, far = photos_of(scene, row, settings)
+    views = scene.views[ROWS[row][2]]
+    stems = [stem for stem in scene.rainy if stem in views]
     config = {key: settings[key] for key in FIELD}
-    field = build_around("fast", list(views.values()), near, far, device=device, **config)
+    model = build_around("fast", list(views.values()), near, far, device=device, **config)
     buffer = RayBuffer(photos, settings["seed"], device)
     if device == "cpu":  # the first fit of a process compiles, or reads what was compiled
-        fit(copy.deepcopy(field), buffer, steps=2, batch_rays=64, seed=0, threads=threads)
+        fit(copy.deepcopy(model), buffer, steps=2, batch_rays=64, seed=0, threads=threads)
     clock = time.process_time if device == "cpu" else time.perf_counter
     begin = clock()
-    fit(field, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
+    fit(model, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
         seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
         average=settings["average"], threads=threads)  # fmt: skip
     seconds = clock() - begin
@@ -206,7 +222,7 @@ def measure(
         view = views[stem]
         size = (view.width, view.height)
         renders[stem] = render_view(
-            field, view.cam_from_world, view.intrinsics, size, near, far, device=device
+            model, view.cam_from_world, view.intrinsics, size, near, far, device=device
         )
     errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
     whole = np.mean([_psnr(error) for error in errors.values()])
@@ -217,12 +233,17 @@ def measure(
 def seen_pixels(
     scene: Scene, renders: dict[str, RenderedView], fewest: int = 3
 ) -> dict[str, np.ndarray]:
-    """By stem, which pixels show a surface that at least ``fewest`` fitted photos saw uncovered."""
+    """By stem, which pixels show a surface that at least ``fewest`` fitted photos saw uncovered.
+
+    Where surfaces are is the truth's word, or else the renderings'.
+    """
     views = scene.views["true"]
 
     def witness(stem: str) -> Witness:
         view, keep_mask = views[stem], scene.coverage[stem] <= TRUE_COVERAGE
-        return Witness(view.cam_from_world, view.intrinsics, keep_mask, renders[stem].depth)
+        depth = scene.depth[stem] if scene.depth else renders[stem].depth
+        depth = np.where(depth > 0, depth, SKY)
+        return Witness(view.cam_from_world, view.intrinsics, keep_mask, depth)
 
     names = list(scene.rainy)
     train = [witness(stem) for i, stem in enumerate(names) if i % 8]
@@ -260,7 +281,7 @@ def main() -> None:
               f"{settings['steps']} steps of {settings['batch_rays']} rays")  # fmt: skip
         print(f"{'photos':6} {'masks':8} {'poses':5} {'PSNR':>6} {'gap':>6} {'seen':>6} "
               f"{'gap':>6} {'cpu s' if flags.device == 'cpu' else 's':>6}", flush=True)  # fmt: skip
-        seen: dict[str, np.ndarray] = {}
+        seen = seen_pixels(scene, {}) if scene.depth else {}
         clean: dict[str, Result] = {}
         for row in flags.rows.split(","):
             kind, masks, poses = ROWS[row]

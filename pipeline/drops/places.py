@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipeline.drops import places_harbour, places_room, places_street
+from pipeline.drops import places_diorama, places_harbour, places_room, places_street
 from pipeline.drops.places_parts import Array, Builder, Lamp, TexturedMesh
 from pipeline.drops.places_textures import noise
 from pipeline.errors import UserError
@@ -98,8 +98,18 @@ def _harbour(rng: Rng) -> tuple[Builder, dict[str, object]]:
                "lamps": lamps, "grey": 0.10}  # fmt: skip
 
 
+def _diorama(rng: Rng) -> tuple[Builder, dict[str, object]]:
+    b = places_diorama.build(rng)
+    warm = np.array([1.0, 0.93, 0.82]) * rng.uniform(2.2, 3.2)
+    sky = clear_sky(rng, np.array([0.20, 0.42, 0.85]) * 0.7, np.array([0.62, 0.78, 0.95]) * 0.75,
+                    np.array([0.85, 0.85, 0.86]), cover=rng.uniform(0.35, 0.6))  # fmt: skip
+    sun = [rng.uniform(-0.6, 0.6), -0.7, -0.7]  # behind the camera
+    return b, {"sky": sky, "sun": sun, "irradiance": warm, "lamps": []}
+
+
 _PLACES: dict[str, Callable[[Rng], tuple[Builder, dict[str, object]]]] = {
     "street": _street,
+    "diorama": _diorama,
     "room": _room,
     "harbour": _harbour,
 }

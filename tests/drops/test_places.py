@@ -94,7 +94,8 @@ def _panels(monkeypatch: pytest.MonkeyPatch, name: str, seed: int) -> list[tuple
 
 
 @pytest.mark.parametrize(
-    ("name", "seed"), [("street", 3), ("street", 7), ("street", 100), ("room", 12), ("harbour", 3)]
+    ("name", "seed"),
+    [("street", 3), ("street", 7), ("street", 100), ("diorama", 5), ("room", 12), ("harbour", 3)],
 )
 def test_no_two_surfaces_lie_in_one_plane(
     monkeypatch: pytest.MonkeyPatch, name: str, seed: int

@@ -11,8 +11,8 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import field, quality
-from benchmarks.quality import Scene, shrunk
+from benchmarks import budget, field, quality
+from benchmarks.quality import Scene, seen_pixels, shrunk
 from pipeline.geometry.rays import pixel_rays
 from pipeline.io.transforms import View
 
@@ -80,3 +80,40 @@ def test_compiling_is_no_part_of_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     settings |= {"levels": 1, "table_log2": 10, "resolution": 32, "steps": 50}
     assert quality.measure(two, "clean", settings, 1, {}).seconds < 0.2
     assert second.steps[-1] == 50
+
+
+def nine(wet: dict[str, np.ndarray], depth: np.ndarray) -> Scene:
+    """Nine photos from one place, the first and the last held out, of a wall at ``depth`` ``(4, 6)``."""
+    view = scene().views["true"]["a"]
+    stems = [f"{number}" for number in range(9)]
+    grey = {stem: np.full((4, 6, 3), 0.5, np.float32) for stem in stems}
+    coverage = {stem: wet.get(stem, np.zeros((4, 6), np.float32)) for stem in stems}
+    views = {"true": {stem: replace(view, name=stem) for stem in stems}}
+    return Scene(grey, grey, coverage, {}, views, {stem: depth for stem in stems})
+
+
+@pytest.mark.parametrize("depth", [3.0, 0.0])
+def test_seen_is_what_three_fitted_photos_show_dry_where_the_truth_puts_it(depth: float) -> None:
+    wet = np.zeros((4, 6), np.float32)
+    wet[:2, :2] = 1.0
+    for number, expected in ((4, True), (5, False)):  # of seven that are fitted
+        covered = {f"{n + 1}": wet for n in range(number)}
+        seen = seen_pixels(nine(covered, np.full((4, 6), depth, np.float32)), {})
+        assert list(seen) == ["0", "8"]
+        assert seen["8"][0, 0] == expected and seen["8"][2:, 2:].all()
+
+
+def test_a_fit_is_as_long_as_its_seconds_allow(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+
+    def costs(model: Any, buffer: Any, *, steps: int, **how: Any) -> None:
+        clock[0] += 0.25 * steps
+
+    monkeypatch.setattr(budget, "fit", costs)
+    monkeypatch.setattr(budget.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
+    settings = yaml.safe_load((quality.ROOT / "params.yaml").read_text())["nerf"]
+    settings |= {"levels": 1, "table_log2": 10, "resolution": 32}
+    row = budget.measure(nine({}, np.full((4, 6), 3.0, np.float32)), "clean", 60.0, 1, settings)
+    assert (row.steps, row.seconds) == (240, 60.0)
+    assert row.psnr == pytest.approx(row.seen) and np.isfinite(row.psnr)

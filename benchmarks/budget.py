@@ -1,0 +1,115 @@
+"""What a fit of so many seconds reaches on a scene of known truth: rays per second, held-out PSNR, oracle gap.
+
+    python -m benchmarks.budget experiments/scenes/data/diorama                       # about ten minutes
+    python -m benchmarks.budget experiments/scenes/data/diorama-move --rows clean,true --set levels=4
+
+Scenes and rows are those of `benchmarks.quality`. Each fit is a whole one: forty steps are timed first, and
+its schedule is made as long as the seconds allow; they are wall time on an otherwise idle machine. Every
+view that is held out is then rendered, on all threads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import yaml
+
+from benchmarks.quality import FIELD, ROOT, ROWS, Scene, load, photos_of, seen_pixels
+from pipeline.field.buffer import RayBuffer
+from pipeline.field.fit import fit
+from pipeline.field.model import build_around
+from pipeline.field.render import RenderedView, render_view
+
+PILOT = 40
+
+
+class Budget(NamedTuple):
+    """One fit: its steps, what they took, held-out PSNR (whole image, seen pixels), seconds per view."""
+
+    steps: int
+    seconds: float
+    psnr: float
+    seen: float
+    view_seconds: float
+
+
+def measure(
+    scene: Scene, row: str, seconds: float, threads: int, settings: dict[str, Any]
+) -> Budget:
+    """Fits one row's photos for about ``seconds`` and compares the held-out views."""
+    photos, held_out, near, far = photos_of(scene, row, settings)
+    views = scene.views[ROWS[row][2]]
+    config = {key: settings[key] for key in FIELD}
+    model = build_around("fast", list(views.values()), near, far, **config)
+    buffer = RayBuffer(photos, settings["seed"])
+
+    def timed(model: Any, steps: int) -> float:
+        begin = time.perf_counter()
+        fit(model, buffer, steps=steps, batch_rays=settings["batch_rays"], seed=settings["seed"],
+            rate=settings["rate"], average=settings["average"], threads=threads)  # fmt: skip
+        return time.perf_counter() - begin
+
+    timed(copy.deepcopy(model), 2)  # compiles, or reads what was compiled
+    steps = max(PILOT, int(seconds / timed(copy.deepcopy(model), PILOT) * PILOT))
+    taken = timed(model, steps)
+
+    def render(stem: str) -> RenderedView:
+        view = views[stem]
+        size = (view.width, view.height)
+        return render_view(model, view.cam_from_world, view.intrinsics, size, near, far)
+
+    torch.set_num_threads(1)
+    begin = time.perf_counter()
+    with ThreadPoolExecutor(threads) as pool:
+        renders = dict(zip(held_out, pool.map(render, held_out), strict=True))
+    each = (time.perf_counter() - begin) / len(held_out)
+    errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
+    inside = seen_pixels(scene, {}) if scene.depth else {}
+    seen = np.mean([_psnr(errors[stem][inside[stem]]) for stem in inside]) if inside else np.nan
+    whole = np.mean([_psnr(error) for error in errors.values()])
+    return Budget(steps, taken, float(whole), float(seen), each)
+
+
+def _psnr(squares: np.ndarray) -> float:
+    return float(-10.0 * np.log10(squares.mean()))
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "scenes", type=Path, nargs="+", help="folders like experiments/scenes/data/street"
+    )
+    parser.add_argument("--seconds", type=float, nargs="+", default=[60.0, 180.0])
+    parser.add_argument("--rows", default="clean")
+    parser.add_argument("--threads", type=int, nargs="+", default=[2])
+    parser.add_argument("--set", nargs="*", default=[], help="parameters of params.yaml, key=value")
+    flags = parser.parse_args()
+    settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
+    settings |= {pair.split("=")[0]: yaml.safe_load(pair.split("=")[1]) for pair in flags.set}
+    print(f"{'scene':14} {'row':12} {'threads':>7} {'steps':>6} {'fit s':>7} {'rays/s':>9} "
+          f"{'PSNR':>6} {'gap':>6} {'seen':>6} {'gap':>6} {'s/view':>7}", flush=True)  # fmt: skip
+    for folder in flags.scenes:
+        scene = load(folder, ROOT / "artifacts" / folder.name)
+        for threads in flags.threads:
+            for seconds in flags.seconds:
+                clean = (np.nan, np.nan)
+                for row in flags.rows.split(","):
+                    out = measure(scene, row, seconds, threads, settings)
+                    clean = (out.psnr, out.seen) if row == "clean" else clean
+                    rate = out.steps * settings["batch_rays"] / out.seconds
+                    print(f"{folder.name:14} {row:12} {threads:7d} {out.steps:6d} "
+                          f"{out.seconds:7.1f} {rate:9,.0f} {out.psnr:6.2f} {clean[0] - out.psnr:6.2f} "
+                          f"{out.seen:6.2f} {clean[1] - out.seen:6.2f} {out.view_seconds:7.2f}",
+                          flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
