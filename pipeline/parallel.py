@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +21,7 @@ from tqdm import tqdm
 from pipeline.errors import UserError
 
 ANSWER_WITHIN = "10s"
+STREAM_BYTES = 2**30
 
 
 def cores() -> int:
@@ -56,6 +57,18 @@ def map_named(
     sizes = {task.key: (counts or {}).get(name, 1) for name, task in tasks.items()}
     compute = _on_cluster if scheduler else _on_threads
     return compute(tasks, sizes, job_label, scheduler or "", workers or cores())
+
+
+def stream_named(
+    function: Callable[..., Any], items: Mapping[str, tuple[Any, ...]], each: int, **how: Any
+) -> Iterator[Any]:
+    """As :func:`map_named`, one result after the other in the order of the names, each of `each` bytes.
+
+    No more are held at a time than STREAM_BYTES.
+    """
+    names = sorted(items)
+    for run in cut(len(names), max(1, STREAM_BYTES // max(1, each)), 1):
+        yield from map_named(function, {names[i]: items[names[i]] for i in run}, **how).values()
 
 
 def cut(count: int, longest: int, workers: int) -> list[range]:

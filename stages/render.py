@@ -22,7 +22,7 @@ from pipeline.io.masks import read_keep_mask
 from pipeline.io.posed import posed_records
 from pipeline.io.transforms import View, read_transforms
 from pipeline.io.video import write_video
-from pipeline.parallel import map_named
+from pipeline.parallel import map_named, stream_named
 from pipeline.stage import Job, Section, run
 
 
@@ -106,9 +106,10 @@ def _film(job: Job, params: Params, views: list[View], out: Path, how: dict[str,
     poses = camera_path(cams, bounds, params.path_frames)
     how_seen = (job.paths.nerf, job.device, views[len(views) // 2])
     items = {f"{i:05d}": (*how_seen, pose, params.path_scale) for i, pose in enumerate(poses)}
-    frames = map_named(_frame, items, job_label="film", **how)
+    size = int(3 * how_seen[2].width * how_seen[2].height * params.path_scale**2)
+    frames = stream_named(_frame, items, size, job_label="film", **how)
     torch.set_num_threads(1)
-    write_video(out / "path.mp4", (f / np.float32(255.0) for f in frames.values()), params.path_fps)
+    write_video(out / "path.mp4", (f / np.float32(255.0) for f in frames), params.path_fps)
 
 
 def _frame(nerf: Path, device: str, view: View, pose: np.ndarray, scale: float) -> np.ndarray:

@@ -1,14 +1,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from subprocess import check_output
+from typing import Any
 
 import numpy as np
 import pytest
 from distributed import LocalCluster
 
+from pipeline import parallel
 from pipeline.errors import UserError
 from pipeline.io.images import image_size, write_image
 from pipeline.io.photos import convert, examine
@@ -129,3 +131,19 @@ def test_scenes_that_share_a_cluster_do_not_get_each_others_images(
     for scene in ("garden", "street"):
         assert set(found[scene].values()) == {f"{scene}\n".encode()}
         assert len(list((tmp_path / scene).iterdir())) == 3
+
+
+def test_a_stream_holds_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "STREAM_BYTES", 100)
+    runs: list[int] = []
+
+    def counted(function: Callable[..., Any], items: Mapping[str, Any], **how: Any) -> Any:
+        runs.append(len(items))
+        return map_named(function, items, **how)
+
+    monkeypatch.setattr(parallel, "map_named", counted)
+    items = {f"{number}": (number,) for number in range(7)}
+    assert list(parallel.stream_named(_square, items, 30, job_label="test")) == [
+        number * number for number in range(7)
+    ]
+    assert max(runs) <= 3 and sum(runs) == 7

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.evaluation import flip
-from pipeline.evaluation.image import psnr, ssim
-from pipeline.evaluation.lpips import Lpips, load_lpips, lpips
+from pipeline.evaluation.image import WINDOW_RADIUS, psnr, ssim
+from pipeline.evaluation.lpips import SMALLEST_SIDE, Lpips, load_lpips, lpips
 from pipeline.evaluation.masks import mask_counts
 from pipeline.evaluation.references import read_reference
 from pipeline.io.images import read_image
@@ -61,7 +61,7 @@ def score_image(files: Files, threshold: float, backbone: Path | None) -> dict[s
             numbers |= _whole("test", view, clean)
             numbers |= _selected("covered.psnr", view, clean, ~keep)
             numbers |= _selected("kept.psnr", view, clean, keep)
-            if backbone is not None:
+            if backbone is not None and min(view.shape[:2]) >= SMALLEST_SIDE:
                 numbers["test.lpips"] = lpips(_model(backbone), view, clean)
     if clean is None:
         return numbers
@@ -78,7 +78,9 @@ def _against(name: str, view: np.ndarray, clean: np.ndarray, keep: np.ndarray) -
 
 
 def _whole(name: str, view: np.ndarray, clean: np.ndarray) -> dict[str, float]:
-    numbers = {f"{name}.psnr": psnr(view, clean), f"{name}.ssim": ssim(view, clean)}
+    numbers = {f"{name}.psnr": psnr(view, clean)}
+    if min(view.shape[:2]) > 2 * WINDOW_RADIUS:
+        numbers[f"{name}.ssim"] = ssim(view, clean)
     if flip.AVAILABLE:
         numbers[f"{name}.flip"] = flip.flip(view, clean)
     return numbers

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pipeline.evaluation import flip, lpips
+from pipeline.evaluation.image import WINDOW_RADIUS
 from pipeline.evaluation.masks import MaskCounts, mask_scores
 
 Rows = Mapping[str, Mapping[str, float]]
@@ -17,30 +18,32 @@ DIGITS = 6
 # What is averaged over images, and which reasons can stand against it, the strongest first.
 _AVERAGES: dict[str, tuple[str, ...]] = {
     "test.psnr": ("clean", "test"),
-    "test.ssim": ("clean", "test"),
+    "test.ssim": ("clean", "test", "window"),
     "test.flip": ("clean", "test", "flip"),
-    "test.lpips": ("clean", "test", "lpips"),
+    "test.lpips": ("clean", "test", "lpips", "pools"),
     "covered.psnr": ("clean", "test", "covered"),
     "kept.psnr": ("clean", "test", "kept"),
     "fitted.psnr": ("clean", "fitted"),
-    "fitted.ssim": ("clean", "fitted"),
+    "fitted.ssim": ("clean", "fitted", "window"),
     "fitted.flip": ("clean", "fitted", "flip"),
     "fitted.covered_psnr": ("clean", "fitted", "covered"),
     "composite.psnr": ("clean", "composite"),
-    "composite.ssim": ("clean", "composite"),
+    "composite.ssim": ("clean", "composite", "window"),
     "composite.flip": ("clean", "composite", "flip"),
     "composite.covered_psnr": ("clean", "composite", "covered"),
     "input.psnr": ("clean", "composite"),
-    "input.ssim": ("clean", "composite"),
+    "input.ssim": ("clean", "composite", "window"),
     "input.flip": ("clean", "composite", "flip"),
     "input.covered_psnr": ("clean", "composite", "covered"),
     "masks.coverage": (),
     "masks.true_coverage": ("coverage",),
     "selfcheck.kept_psnr": ("test", "kept"),
 }
-_NO_PIXELS = {
+_TOO_FEW = {
     "covered": "the masks cover no pixel of these views",
     "kept": "the masks cover every pixel of these views",
+    "window": f"SSIM needs more than {2 * WINDOW_RADIUS} pixels each way",
+    "pools": f"LPIPS needs {lpips.SMALLEST_SIDE} pixels each way",
 }
 COLUMNS = ("split", *_AVERAGES, "masks.hits", "masks.false_alarms", "masks.misses")
 
@@ -54,7 +57,7 @@ def summarise(rows: Rows, reasons: Mapping[str, str]) -> dict[str, Any]:
     the pixels of all images.
     """
     numbers: dict[str, Any] = {}
-    known = {**_NO_PIXELS, **reasons}
+    known = {**_TOO_FEW, **reasons}
     for name, needs in _AVERAGES.items():
         values = [row[name] for row in rows.values() if name in row]
         why = next((known[need] for need in needs if need in known), None)

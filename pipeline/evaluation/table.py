@@ -143,7 +143,10 @@ def main(paths: Sequence[str]) -> int:
         print("usage: python -m pipeline.evaluation.table METRICS.json ...", file=sys.stderr)
         return 2
     try:
-        fits = {label_of(Path(path)): read_metrics(Path(path)) for path in paths}
+        labels = [label_of(Path(path)) for path in paths]
+        if len(set(labels)) < len(labels):  # of two folders of artifacts
+            labels = list(paths)
+        fits = {label: read_metrics(Path(path)) for label, path in zip(labels, paths, strict=True)}
     except UserError as error:
         print(error, file=sys.stderr)
         return 2

@@ -15,6 +15,8 @@ from pipeline.field.base import Rays
 from pipeline.geometry.rays import pixel_rays
 from pipeline.io.posed import PosedImage
 
+DEEPEST = 1e6  # far over near: beyond ten times this, 1/far is lost beside 1/near in 32 bits
+
 
 @dataclass(frozen=True)
 class PosedPhoto:
@@ -47,12 +49,17 @@ class Batch(NamedTuple):
 def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list[PosedPhoto]:
     """The images that are not held out, in their order.
 
-    UserError when there is none, or nothing between ``near`` and ``far``.
+    UserError when there is none, or nothing between ``near`` and ``far``, or more than 32 bits can tell apart.
     """
     if not 0 < near < far:
         raise UserError(
             f"The poses bound the scene's depth by {near:g} and {far:g}: nothing lies between.",
             "Run `python -m stages.poses` again.",
+        )
+    if far > DEEPEST * near:
+        raise UserError(
+            f"The scene's depths reach from {near:g} to {far:g}: more than {DEEPEST:,.0f} times as far.",
+            "Raise nerf.near_factor, lower nerf.far_factor, or check the depths that came with the poses.",
         )
     photos = [
         PosedPhoto(
@@ -95,7 +102,7 @@ class RayBuffer:
         if order.size == 0:
             raise UserError(
                 "Every pixel of every photo is masked: nothing is left to fit.",
-                hint="Raise masks.threshold or lower masks.dilation.",
+                hint="Raise masks.threshold or lower masks.dilation; look at masks that came with the photos.",
             )
         self.seed, self.device = seed, device
         self.count, self.photos = int(order.size), len(photos)

@@ -230,7 +230,7 @@ def _check_finite(loss: float, step: int) -> None:
     if not math.isfinite(loss):
         raise UserError(
             f"The fit broke down near step {step}: its loss is {loss}.",
-            hint="Lower nerf.rate (0.5, say), or change nerf.seed.",
+            hint="Lower nerf.rate (0.5, say; in `refine` refine.rate), or change nerf.seed.",
         )
 
 

@@ -11,6 +11,7 @@ from pipeline.field.base import Field, Rays
 from pipeline.geometry.rays import pixel_rays
 
 CHUNK = 2048  # rays: what a core keeps in its cache; larger chunks are slower
+CPU_SAMPLES = 2**16  # at a time on each core: the paper's field takes 2 kB for each
 CUDA_SAMPLES = 2**20  # at a time on a GPU, which has too little to do with fewer; one to two GB
 
 
@@ -53,7 +54,10 @@ def render_view(
     """
     width, height = size
     if chunk is None:
-        chunk = CHUNK if device == "cpu" else max(1, CUDA_SAMPLES // field.samples_per_ray())
+        samples = field.samples_per_ray()
+        chunk = max(1, CUDA_SAMPLES // samples)
+        if device == "cpu":
+            chunk = min(CHUNK, max(1, CPU_SAMPLES // samples))
     pose = torch.from_numpy(np.asarray(cam_from_world, np.float32)[:3, :4]).to(device)
     camera = torch.tensor(intrinsics, dtype=torch.float32, device=device)
     parts = []

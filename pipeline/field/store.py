@@ -21,6 +21,7 @@ from pipeline.field.grid_field import GridField
 from pipeline.field.model import describe, restore
 from pipeline.field.paper_field import PaperField
 from pipeline.io.atomic import read_json, write_json
+from pipeline.io.code import code_key
 from pipeline.io.tensors import load_tensors, save_tensors
 
 log = logging.getLogger(__name__)
@@ -80,8 +81,7 @@ def fit_key(
     """A hash of everything that decides a fit's result: for :class:`Checkpoint`."""
     about = {"field": describe(field), "settings": dict(settings), "device": device}
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
+    digest.update(code_key("field", "geometry").encode())
     for photo in photos:
         numbers = [*photo.intrinsics, photo.near, photo.far]
         for array in (photo.image, photo.keep_mask, photo.cam_from_world, np.array(numbers)):
@@ -104,7 +104,9 @@ class Checkpoint:
         save_tensors(self.file, tensors, {"key": self.key, "step": str(step)})
 
     def load(self, device: str = "cpu") -> tuple[int, dict[str, Tensor]] | None:
-        """Step and state of this very fit, if it was interrupted."""
+        """Step and state of this very fit, if it was interrupted; what a kill left of a save is gone."""
+        for torn in self.file.parent.glob(f".{self.file.name}.tmp-*"):
+            torn.unlink(missing_ok=True)
         if not self.file.is_file():
             return None
         try:

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
+
+from pipeline.geometry.rays import undistort
 
 TOLERANCE = 0.05
 
@@ -29,11 +32,10 @@ def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) 
     height, width = view.depth.shape
     rows, columns = np.mgrid[0:height:stride, 0:width:stride]
     depth = view.depth[::stride, ::stride].astype(np.float64).ravel()
-    xd, yd = (columns.ravel() + 0.5 - cx) / fx, (rows.ravel() + 0.5 - cy) / fy
-    x, y = xd, yd
-    for _ in range(8 if k1 else 0):
-        gain = 1.0 + k1 * (x * x + y * y)
-        x, y = xd / gain, yd / gain
+    x, y = (columns.ravel() + 0.5 - cx) / fx, (rows.ravel() + 0.5 - cy) / fy
+    if k1:
+        bent = torch.from_numpy(x), torch.from_numpy(y)
+        x, y = (flat.numpy() for flat in undistort(*bent, torch.tensor(k1, dtype=bent[0].dtype)))
     world_from_cam = np.linalg.inv(view.cam_from_world)
     cam = np.stack([x * depth, y * depth, depth])
     points = world_from_cam[:3, :3] @ cam + world_from_cam[:3, 3:]

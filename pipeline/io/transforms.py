@@ -23,6 +23,9 @@ from pipeline.io.atomic import read_json, write_json
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 Place = tuple[float, float, float]
 ORIGIN: Place = (0.0, 0.0, 0.0)
+MOST_FOLDED = (
+    0.145  # -k1 r^2 in the picture up to which a ray leads there (`pipeline.geometry.rays`)
+)
 FAR_OFF = 1e4  # units from the origin up to which poses stay: 32 bits know these to a thousandth
 
 
@@ -53,6 +56,12 @@ class View:
     def world_from_cam(self) -> np.ndarray:
         """(4, 4) inverse of `cam_from_world`."""
         return np.linalg.inv(self.cam_from_world)
+
+    def without_ray(self) -> np.ndarray:
+        """Which pixels (H, W) no ray leads to: those beyond where a lens with k1 < 0 folds back."""
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        return np.asarray(-self.k1 * (x[None, :] ** 2 + y[:, None] ** 2) > MOST_FOLDED)
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float, float]:

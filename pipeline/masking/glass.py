@@ -67,8 +67,8 @@ class PaneGlass:
     """A plane in the scene, with the pixels of the mean camera for cells.
 
     `pane_from_world` (4, 4) is rigid; the plane is z = 0. The raster spans what the views see of it;
-    cells grow when it would hold more than `max_cells`. ValueError when the mean camera or every view
-    looks away from the plane.
+    cells grow when it would hold more than `max_cells`. `mean`: another camera (4, 4) than the mean one.
+    ValueError when the mean camera or every view looks away from the plane.
     """
 
     def __init__(
@@ -76,9 +76,12 @@ class PaneGlass:
         pane_from_world: np.ndarray,
         cameras: Sequence[GlassCamera],
         max_cells: int = MAX_CELLS,
+        mean: np.ndarray | None = None,
     ) -> None:
         self.cameras = list(cameras)
-        mean = mean_camera(np.stack([camera.cam_from_world for camera in cameras]))
+        if mean is None:
+            mean = mean_camera(np.stack([camera.cam_from_world for camera in cameras]))
+        self.mean = mean
         mean_from_pane = mean @ invert(pane_from_world)
         normal = mean_from_pane[:3, 2]
         offset = float(normal @ mean_from_pane[:3, 3])

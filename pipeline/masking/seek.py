@@ -30,8 +30,7 @@ class Seeker:
     def first(self, attentions: Sequence[np.ndarray]) -> tuple[Found, Glass]:
         """The glass as the attention maps show it."""
         found = find_glass(attentions, self.cameras, self.farthest, at_least=self.at_least)
-        found = self._granted(found)
-        return found, self._glass(found, attentions)
+        return self._on(self._granted(found), attentions)
 
     def again(
         self,
@@ -47,7 +46,7 @@ class Seeker:
         found, glass = before
         if attentions is None or not isinstance(glass, PaneGlass):
             found = self._look_again(residuals, found)
-            glass = self._glass(found, residuals if attentions is None else attentions)
+            found, glass = self._on(found, residuals if attentions is None else attentions)
         if isinstance(glass, PaneGlass):
             found = found._replace(pane_agreement=agreement_on(glass, residuals))
         return found, glass
@@ -71,14 +70,19 @@ class Seeker:
             return found
         return found._replace(mode=self.wish)
 
-    def _glass(self, found: Found, maps: Sequence[np.ndarray | None]) -> Glass:
-        """On a pane the views are brought to cover by their `maps`."""
+    def _on(
+        self, found: Found, maps: Sequence[np.ndarray | None]
+    ) -> tuple[Found, PaneGlass | LensGlass]:
+        """The glass that was found; on a pane the views are brought to cover by their `maps`."""
         width, height = self.cameras[0].width, self.cameras[0].height
         if found.mode == "pane" and found.pane_from_world is not None:
-            glass = PaneGlass(found.pane_from_world, self.cameras)
+            try:
+                glass = PaneGlass(found.pane_from_world, self.cameras)
+            except ValueError:  # some of the views agreed on it, but all together look elsewhere
+                return found._replace(mode="none"), LensGlass(height, width)
             glass.moved = aligned(glass, maps, max(width, height) / OFF)
-            return glass
-        return LensGlass(height, width)
+            return found, glass
+        return found, LensGlass(height, width)
 
 
 def cover(glass: PaneGlass, attentions: Sequence[np.ndarray]) -> float:

@@ -107,7 +107,11 @@ def stack_on(glass: PaneGlass, maps: Sequence[np.ndarray | None]) -> np.ndarray:
     fine, cameras = prepared(
         [values for values in maps if values is not None], [glass.cameras[v] for v in known], FINE
     )
-    own = PaneGlass(glass.pane_from_world, cameras, max_cells=3 * fine[0].size)
+    plane, cells = glass.pane_from_world, 3 * fine[0].size
+    try:
+        own = PaneGlass(plane, cameras, cells)
+    except ValueError:  # of cameras all around, the mean of some may look away
+        own = PaneGlass(plane, cameras, cells, glass.mean)
     own.moved = glass.moved[known]
     return _stack(own, fine)
 

@@ -4,10 +4,17 @@ import csv
 import io
 import json
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pipeline.evaluation import score
+from pipeline.evaluation.score import Files
 from pipeline.evaluation.summary import as_csv, average, headline, summarise
+from pipeline.io.images import write_image
+from pipeline.io.masks import write_keep_mask
+from pipeline.io.scene import ImageRecord
 
 ROWS = {
     "a.png": {
@@ -84,3 +91,27 @@ def test_headline(reasons):
     assert (
         ("no truth" in sentence and "28.00 dB" in sentence) if reasons else "25.00 dB" in sentence
     )
+
+
+@pytest.mark.parametrize(
+    ("side", "missing"), [(9, {"ssim", "lpips"}), (30, {"lpips"}), (31, set())]
+)
+def test_an_image_too_small_for_a_measure_goes_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, side: int, missing: set[str]
+) -> None:
+    picture = np.random.default_rng(0).random((side, side + 3, 3)).astype(np.float32)
+    for name in ("photo", "view", "clean"):
+        write_image(tmp_path / f"{name}.png", picture)
+        picture = 0.9 * picture
+    write_keep_mask(tmp_path / "keep.png", np.ones(picture.shape[:2], bool))
+    record = ImageRecord("photo.png", "photo.png", "", side + 3, side, None, "test", 0)
+    paths = {name: tmp_path / f"{name}.png" for name in ("photo", "view", "clean", "keep")}
+    files = Files(record, paths["photo"], paths["photo"], paths["keep"], paths["view"], None, None,
+                  paths["clean"], None)  # fmt: skip
+    monkeypatch.setattr(score, "_model", lambda backbone: None)
+    monkeypatch.setattr(score, "lpips", lambda model, a, b: 0.5)
+    rows = {"photo.png": score.score_image(files, 0.05, tmp_path)}
+    test = summarise(rows, {})["test"]
+    assert {name for name in ("psnr", "ssim", "lpips") if test[name] is None} == missing
+    for name in missing:
+        assert "pixels each way" in test[f"{name}_reason"]

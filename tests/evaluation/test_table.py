@@ -69,3 +69,8 @@ def test_the_command(tmp_path, capsys):
     assert main([str(path.with_name("none.json"))]) == 2
     assert "none.json does not exist" in capsys.readouterr().err
     assert main([]) == 2
+    other = tmp_path / "before" / "artifacts" / "demo" / "metrics.json"
+    write_json(other, MASKED | {"conventions": {"mask_threshold": 0.05}})
+    assert main([str(path), str(other)]) == 0
+    told = capsys.readouterr().out
+    assert str(path) in told and str(other) in told  # not one of the two as "demo"

@@ -200,16 +200,19 @@ def test_the_shape_network(half: bool, close: float) -> None:
         assert float((one - other).norm() / one.norm()) < close
 
 
+@pytest.mark.parametrize("step", [0, 200])
 @pytest.mark.parametrize("space", [NDC, BALL])
-def test_a_whole_step(space: Space) -> None:
+def test_a_whole_step(space: Space, step: int) -> None:
+    """Of the later one the rays farthest off have no part."""
     rays = some_rays()
     observed, none = torch.rand(R, 3, generator=source(3)), torch.zeros(R)
     results = []
     for plain in (True, False):
-        field = taught_field(replace(SMALL, distortion=0.1), space)
+        field = taught_field(replace(SMALL, distortion=0.1, trim=0.3), space)
         field.plain = plain
         sink: list[TableGradient] = []
-        loss, _ = field.loss(rays, observed, none, 0, source(4), sink)
+        loss, _ = field.loss(rays, observed, none, step, source(4), sink)
+        assert field.phase(step).trimmed == (step == 200)
         named = dict(field.named_parameters())
         found = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
         gradients = {n: g for n, g in zip(named, found, strict=True) if g is not None}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pipeline.errors import UserError
+from pipeline.field.buffer import photos_to_fit
 from pipeline.field.sampling import (
     depth_at,
     intervals_around,
@@ -54,3 +56,9 @@ def test_intervals_enclose_their_samples() -> None:
     # Midpoints 0.3 and 0.6 between the samples; the outer gaps 0.1 and 0.2 mirrored, 1.0 the end.
     edges = intervals_around(torch.tensor([[0.2, 0.4, 0.8]]))
     assert edges[0].tolist() == pytest.approx([0.1, 0.3, 0.6, 1.0])
+
+
+@pytest.mark.parametrize(("near", "far"), [(1e-3, 2e3), (3.0, 2.0)])
+def test_depths_that_cannot_be_told_apart_are_refused(near: float, far: float) -> None:
+    with pytest.raises(UserError, match="depth"):
+        photos_to_fit([], near, far)

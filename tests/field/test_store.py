@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from pipeline.errors import UserError
+from pipeline.field import store
 from pipeline.field.buffer import PosedPhoto
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.store import Checkpoint, fit_key, load_field, save_field
@@ -104,3 +105,24 @@ def test_anything_that_decides_the_result_changes_the_key(changed: dict[str, obj
     assert key != fit_key(field, [photo(**changed)], settings, "cpu")
     assert key != fit_key(field, [photo()], settings | {"steps": 11}, "cpu")
     assert key != fit_key(field, [photo()], settings, "cuda")
+
+
+def test_what_a_kill_left_of_a_save_is_gone_when_the_fit_begins_again(tmp_path: Path) -> None:
+    checkpoint = Checkpoint(tmp_path / "checkpoint.safetensors", "key")
+    checkpoint.save(3, {"x": torch.ones(2)})
+    torn = tmp_path / ".checkpoint.safetensors.tmp-12345"
+    torn.write_bytes(b"half")
+    loaded = checkpoint.load()
+    assert loaded is not None and loaded[0] == 3
+    assert not torn.exists()
+
+
+def test_a_fit_begins_anew_when_rays_are_made_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = GridField(TINY, SPACE, 1)
+    before = fit_key(field, [photo()], {}, "cpu")
+    assert before == fit_key(field, [photo()], {}, "cpu")
+    known = store.code_key
+    monkeypatch.setattr(
+        store, "code_key", lambda *rooms: known(*rooms) + "2" * ("geometry" in rooms)
+    )
+    assert before != fit_key(field, [photo()], {}, "cpu")

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from pipeline.geometry.rays import (
+    MOST_FOLDED,
     _by_tensors,
     _in_one_pass,
     pixel_rays,
     project,
     undistort,
 )
+from pipeline.io import transforms
+from pipeline.io.transforms import View
 
 
 def a_camera() -> torch.Tensor:
@@ -80,3 +84,25 @@ def test_rays_made_in_one_pass_are_those_of_tensor_operations(many: bool, distor
         told = columns, rows, cameras, poses, distorted
         for one, other in zip(_in_one_pass(*told), _by_tensors(*told), strict=True):
             assert torch.equal(one, other)
+
+
+def test_beyond_where_a_lens_folds_back_rays_stay_at_the_fold() -> None:
+    """Elsewhere they lead to their pixel; `View.without_ray` tells which is which."""
+    view = View("a", np.eye(4), 400.0, 400.0, 400.0, 300.0, -0.2, 800, 600, 1.0, 9.0)
+    rows, columns = (torch.from_numpy(v.ravel()) for v in np.mgrid[0:600:7, 0:800:7])
+    camera = torch.tensor(view.intrinsics)
+    rays_o, rays_d = pixel_rays(columns, rows, camera, torch.eye(4)[:3])
+    u, v, _ = project(rays_o + rays_d, camera, torch.eye(4)[:3])
+    off = torch.hypot(u - columns, v - rows)
+    beyond = torch.from_numpy(view.without_ray()[::7, ::7].ravel())
+    assert 0.1 < float(beyond.float().mean()) < 0.5
+    assert float(off[~beyond].max()) < 0.05
+    radius = torch.hypot(*rays_d[:2])
+    assert float(radius[beyond].max() / radius[beyond].min()) < 1.001
+    assert bool((rays_d[0] * (columns + 0.5 - 400.0) >= 0).all())
+    assert MOST_FOLDED == transforms.MOST_FOLDED
+
+
+def test_a_lens_that_bends_outwards_has_a_ray_for_every_pixel() -> None:
+    view = View("a", np.eye(4), 400.0, 400.0, 400.0, 300.0, 0.2, 800, 600, 1.0, 9.0)
+    assert not view.without_ray().any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,14 +68,17 @@ def test_what_the_cameras_see_fits_into_the_unit_cube(kind: str) -> None:
     space = fit_space(kind, FACING, corners(FACING), near, far)
     centres = -np.einsum("vji,vj->vi", FACING[:, :3, :3], FACING[:, :3, 3])
     rays = corners(FACING)
-    mapped = torch.stack(
-        [
-            space.warp(torch.from_numpy((centres[:, None] + rays * t).reshape(-1, 3).T.copy()))
-            for t in (2.0, 5.0, 20.0, 50.0)
-        ]
-    )
-    assert float(mapped.min()) >= 0.0
-    assert float(mapped.max()) <= 1.0
+    # Bounds ten times as wide in all directions: what lies outside the own ones is not clamped to them there.
+    middle, half = ((np.array(space.high) + s * np.array(space.low)) / 2 for s in (1, -1))
+    wide = replace(space, low=tuple(middle - 10 * half), high=tuple(middle + 10 * half))
+
+    def placed(space: Space, t: float) -> torch.Tensor:
+        return space.warp(torch.from_numpy((centres[:, None] + rays * t).reshape(-1, 3).T.copy()))
+
+    depths = (2.0, 5.0, 20.0, 50.0)
+    free = torch.stack([(placed(wide, t) - 0.5) * 10 + 0.5 for t in depths])
+    assert float(free.min()) >= -1e-4 and float(free.max()) <= 1.0 + 1e-4
+    mapped = torch.stack([placed(space, t) for t in depths])
     # Nothing was clamped onto one another: different depths stay different.
     assert float((mapped[1:] - mapped[:-1]).norm(dim=1).min()) > 1e-3
 

@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.masking import seek
 from pipeline.masking.agreement import agreement
-from pipeline.masking.sweep import find_glass
+from pipeline.masking.sweep import Found, agreement_on, find_glass
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from pane_scene import cameras, wetness
 
-from pipeline.masking.glass import pane_before
+from pipeline.masking.glass import GlassCamera, LensGlass, PaneGlass, pane_before
 
 
 def test_agreement_by_hand() -> None:
@@ -69,3 +70,38 @@ def test_no_glass_in_unrelated_maps_nor_in_a_common_gradient() -> None:
     shade = np.linspace(0, 1, views[0].height)[:, None]
     maps = [(shade + 0.3 * rng.random((60, 80))).astype(np.float32) for _ in views]
     assert find_glass(maps, views, 4.0, at_least=0.3).mode == "none"
+
+
+def _turned(half_turns: list[int]) -> list[GlassCamera]:
+    """Cameras side by side that look along z, or, where that is 1, the other way."""
+    found = []
+    for number, back in enumerate(half_turns):
+        pose = np.diag([1.0 - 2 * back, 1.0, 1.0 - 2 * back, 1.0])
+        pose[:3, 3] = [0.1 * number, 0, 0]
+        found.append(GlassCamera(pose, (70.0, 70.0, 40.0, 30.0, 0.0), 80, 60))
+    return found
+
+
+def test_a_pane_on_which_some_agree_and_from_which_all_look_away_is_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of cameras all around, those that were swept may have another mean than all of them."""
+    views = _turned([0, 0, 1, 1, 1, 1])
+    pane = pane_before(np.stack([view.cam_from_world for view in views[:2]]), 0.5)
+    with pytest.raises(ValueError, match="looks away"):
+        PaneGlass(pane, views)
+    found = Found("pane", 0.1, 0.8, pane, 0.5, 0.0, 0.0)
+    monkeypatch.setattr(seek, "find_glass", lambda *told, **how: found)
+    maps = [np.zeros((60, 80), np.float32) for _ in views]
+    where, glass = seek.Seeker(views, 2.0, 0.3, "auto").first(maps)
+    assert where.mode == "none" and isinstance(glass, LensGlass)
+
+
+def test_some_views_agree_on_the_pane_of_all_wherever_their_own_mean_looks() -> None:
+    views = _turned([0, 0, 0, 0, 1, 1])
+    pane = pane_before(np.stack([view.cam_from_world for view in views[:4]]), 0.5)
+    glass = PaneGlass(pane, views)
+    maps = [None] * 3 + [np.random.default_rng(3).random((60, 80)).astype(np.float32)] * 3
+    with pytest.raises(ValueError, match="looks away"):
+        PaneGlass(pane, views[3:])
+    assert np.isfinite(agreement_on(glass, maps))
