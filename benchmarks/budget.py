@@ -41,9 +41,9 @@ class Budget(NamedTuple):
 
 
 def measure(
-    scene: Scene, row: str, seconds: float, threads: int, settings: dict[str, Any]
+    scene: Scene, row: str, seconds: float, threads: int, settings: dict[str, Any], steps: int = 0
 ) -> Budget:
-    """Fits one row's photos for about ``seconds`` and compares the held-out views."""
+    """Fits one row's photos for about ``seconds``, or for ``steps``, and compares the held-out views."""
     photos, held_out, near, far = photos_of(scene, row, settings)
     views = scene.views[ROWS[row][2]]
     config = {key: settings[key] for key in FIELD}
@@ -57,7 +57,7 @@ def measure(
         return time.perf_counter() - begin
 
     timed(copy.deepcopy(model), 2)  # compiles, or reads what was compiled
-    steps = max(PILOT, int(seconds / timed(copy.deepcopy(model), PILOT) * PILOT))
+    steps = steps or max(PILOT, int(seconds / timed(copy.deepcopy(model), PILOT) * PILOT))
     taken = timed(model, steps)
 
     def render(stem: str) -> RenderedView:
@@ -67,9 +67,10 @@ def measure(
 
     torch.set_num_threads(1)
     begin = time.perf_counter()
+    stems = held_out + held_out[: -len(held_out) % threads]  # so that no thread stands idle
     with ThreadPoolExecutor(threads) as pool:
-        renders = dict(zip(held_out, pool.map(render, held_out), strict=True))
-    each = (time.perf_counter() - begin) / len(held_out)
+        renders = dict(zip(stems, pool.map(render, stems), strict=True))
+    each = (time.perf_counter() - begin) / len(stems)
     errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
     inside = seen_pixels(scene, {}) if scene.depth else {}
     seen = np.mean([_psnr(errors[stem][inside[stem]]) for stem in inside]) if inside else np.nan
@@ -100,9 +101,12 @@ def main() -> None:
         scene = load(folder, ROOT / "artifacts" / folder.name)
         for threads in flags.threads:
             for seconds in flags.seconds:
-                clean = (np.nan, np.nan)
+                clean, steps = (np.nan, np.nan), 0
                 for row in flags.rows.split(","):
-                    out = measure(scene, row, seconds, threads, settings)
+                    out = measure(scene, row, seconds, threads, settings, steps)
+                    steps = (
+                        out.steps
+                    )  # the rows after the first are as long: their gap is the drops'
                     clean = (out.psnr, out.seen) if row == "clean" else clean
                     rate = out.steps * settings["batch_rays"] / out.seconds
                     print(f"{folder.name:14} {row:12} {threads:7d} {out.steps:6d} "

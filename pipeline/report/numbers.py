@@ -91,7 +91,7 @@ def unmet(scene: str, variant: str) -> list[tuple[str, str]]:
     """Why the fit to compare with is not shown, where it has no numbers: (reason, what)."""
     reason = (
         f"report.compare is {variant}, but artifacts/{scene}/{variant}/metrics.json does not exist: "
-        f"run `python -m stages.evaluate --scene {scene} --variant {variant}`, or correct it"
+        f"name it under comparisons in params.yaml and run `dvc repro report@{scene}`, or correct it"
     )
     return [(reason, "the comparison")]
 
