@@ -1,6 +1,6 @@
 """What a fit of so many seconds reaches on a scene of known truth: rays per second, held-out PSNR, oracle gap.
 
-    python -m benchmarks.budget experiments/scenes/data/diorama                       # about ten minutes
+    python -m benchmarks.budget experiments/scenes/data/diorama                       # about five minutes
     python -m benchmarks.budget experiments/scenes/data/diorama-move --rows clean,true --set levels=4
 
 Scenes and rows are those of `benchmarks.quality`. Each fit is a whole one: forty steps are timed first, and
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 import yaml
 
-from benchmarks.quality import FIELD, ROOT, ROWS, Scene, load, photos_of, seen_pixels
+from benchmarks.quality import FIELD, ROOT, ROWS, Scene, load, photos_of, psnr, seen_pixels
 from pipeline.field.buffer import RayBuffer
 from pipeline.field.fit import fit
 from pipeline.field.model import build_around
@@ -41,9 +41,18 @@ class Budget(NamedTuple):
 
 
 def measure(
-    scene: Scene, row: str, seconds: float, threads: int, settings: dict[str, Any], steps: int = 0
+    scene: Scene,
+    row: str,
+    seconds: float,
+    threads: int,
+    settings: dict[str, Any],
+    seen: dict[str, np.ndarray],
+    steps: int = 0,
 ) -> Budget:
-    """Fits one row's photos for about ``seconds``, or for ``steps``, and compares the held-out views."""
+    """Fits one row's photos for about ``seconds``, or for ``steps``, and compares the held-out views.
+
+    ``seen`` masks by stem, may be empty.
+    """
     photos, held_out, near, far = photos_of(scene, row, settings)
     views = scene.views[ROWS[row][2]]
     config = {key: settings[key] for key in FIELD}
@@ -72,14 +81,9 @@ def measure(
         renders = dict(zip(stems, pool.map(render, stems), strict=True))
     each = (time.perf_counter() - begin) / len(stems)
     errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
-    inside = seen_pixels(scene, {}) if scene.depth else {}
-    seen = np.mean([_psnr(errors[stem][inside[stem]]) for stem in inside]) if inside else np.nan
-    whole = np.mean([_psnr(error) for error in errors.values()])
-    return Budget(steps, taken, float(whole), float(seen), each)
-
-
-def _psnr(squares: np.ndarray) -> float:
-    return float(-10.0 * np.log10(squares.mean()))
+    inside = [psnr(errors[stem][seen[stem]]) for stem in held_out] if seen else [np.nan]
+    whole = np.mean([psnr(error) for error in errors.values()])
+    return Budget(steps, taken, float(whole), float(np.mean(inside)), each)
 
 
 def main() -> None:
@@ -99,14 +103,13 @@ def main() -> None:
           f"{'PSNR':>6} {'gap':>6} {'seen':>6} {'gap':>6} {'s/view':>7}", flush=True)  # fmt: skip
     for folder in flags.scenes:
         scene = load(folder, ROOT / "artifacts" / folder.name)
+        seen = seen_pixels(scene, {}) if scene.depth else {}
         for threads in flags.threads:
             for seconds in flags.seconds:
                 clean, steps = (np.nan, np.nan), 0
                 for row in flags.rows.split(","):
-                    out = measure(scene, row, seconds, threads, settings, steps)
-                    steps = (
-                        out.steps
-                    )  # the rows after the first are as long: their gap is the drops'
+                    out = measure(scene, row, seconds, threads, settings, seen, steps)
+                    steps = out.steps  # of the rows after it too: the gap is the drops'
                     clean = (out.psnr, out.seen) if row == "clean" else clean
                     rate = out.steps * settings["batch_rays"] / out.seconds
                     print(f"{folder.name:14} {row:12} {threads:7d} {out.steps:6d} "

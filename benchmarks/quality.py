@@ -225,8 +225,8 @@ def measure(
             model, view.cam_from_world, view.intrinsics, size, near, far, device=device
         )
     errors = {stem: (renders[stem].rgb - scene.clean[stem]) ** 2 for stem in held_out}
-    whole = np.mean([_psnr(error) for error in errors.values()])
-    inside = [_psnr(errors[stem][seen[stem]]) for stem in held_out] if seen else [np.nan]
+    whole = np.mean([psnr(error) for error in errors.values()])
+    inside = [psnr(errors[stem][seen[stem]]) for stem in held_out] if seen else [np.nan]
     return Result(float(whole), float(np.mean(inside)), seconds, renders)
 
 
@@ -255,7 +255,8 @@ def seen_pixels(
     return out
 
 
-def _psnr(squares: np.ndarray) -> float:
+def psnr(squares: np.ndarray) -> float:
+    """In dB, of squared differences."""
     return float(-10.0 * np.log10(squares.mean()))
 
 
@@ -292,7 +293,7 @@ def main() -> None:
                 if not seen and poses == "true":  # other poses have depths of another unit
                     seen = seen_pixels(scene, result.renders)
                     errors = {s: (result.renders[s].rgb - scene.clean[s]) ** 2 for s in seen}
-                    inside = [_psnr(errors[s][seen[s]]) for s in seen]
+                    inside = [psnr(errors[s][seen[s]]) for s in seen]
                     result = result._replace(seen=float(np.mean(inside)))
                 clean[poses] = result
             best = clean.get(poses)

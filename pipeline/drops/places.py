@@ -64,6 +64,12 @@ def clear_sky(rng: Rng, zenith: Array, horizon: Array, cloud: Array, *, cover: f
     return np.where(d[..., 1:2] > 0.02, below, sky).astype(np.float32)
 
 
+def _bright_sky(rng: Rng) -> Array:
+    zenith, horizon = np.array([0.20, 0.42, 0.85]) * 0.7, np.array([0.62, 0.78, 0.95]) * 0.75
+    cloud = np.array([0.85, 0.85, 0.86])
+    return clear_sky(rng, zenith, horizon, cloud, cover=rng.uniform(0.35, 0.6))
+
+
 def _street(rng: Rng) -> tuple[Builder, dict[str, object]]:
     b = places_street.build(rng)
     azimuth, elevation = rng.uniform(-2.4, 2.4), rng.uniform(0.6, 1.0)
@@ -75,8 +81,7 @@ def _street(rng: Rng) -> tuple[Builder, dict[str, object]]:
         np.cos(elevation) * np.cos(azimuth),
     ]
     warm = np.array([1.0, 0.93, 0.82]) * rng.uniform(2.2, 3.2)
-    sky = clear_sky(rng, np.array([0.20, 0.42, 0.85]) * 0.7, np.array([0.62, 0.78, 0.95]) * 0.75,
-                    np.array([0.85, 0.85, 0.86]), cover=rng.uniform(0.35, 0.6))  # fmt: skip
+    sky = _bright_sky(rng)
     return b, {"sky": sky, "sun": sun, "irradiance": warm, "lamps": []}
 
 
@@ -101,8 +106,7 @@ def _harbour(rng: Rng) -> tuple[Builder, dict[str, object]]:
 def _diorama(rng: Rng) -> tuple[Builder, dict[str, object]]:
     b = places_diorama.build(rng)
     warm = np.array([1.0, 0.93, 0.82]) * rng.uniform(2.2, 3.2)
-    sky = clear_sky(rng, np.array([0.20, 0.42, 0.85]) * 0.7, np.array([0.62, 0.78, 0.95]) * 0.75,
-                    np.array([0.85, 0.85, 0.86]), cover=rng.uniform(0.35, 0.6))  # fmt: skip
+    sky = _bright_sky(rng)
     sun = [rng.uniform(-0.6, 0.6), -0.7, -0.7]  # behind the camera
     return b, {"sky": sky, "sun": sun, "irradiance": warm, "lamps": []}
 

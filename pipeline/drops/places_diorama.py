@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.drops import places_textures as tx
 from pipeline.drops.places_parts import UP, Array, Builder, front, turn
+from pipeline.drops.places_street import BLOCK, BRICK, SETT, TILE
 from pipeline.drops.places_things import at, cell
 
 Rng = np.random.Generator
@@ -19,15 +20,11 @@ RIGHT = np.array([1, 0, 0], np.float32)
 
 def textures(rng: Rng) -> dict[str, Array]:
     """The diorama's twelve materials."""
-    brick = ((0.62, 0.34, 0.26), (0.55, 0.28, 0.22), (0.68, 0.42, 0.32), (0.48, 0.26, 0.22))
-    sett = ((0.52, 0.50, 0.47), (0.44, 0.43, 0.42), (0.58, 0.54, 0.48), (0.40, 0.38, 0.37))
-    block = ((0.74, 0.70, 0.62), (0.68, 0.64, 0.56), (0.78, 0.74, 0.68))
-    tile = ((0.58, 0.30, 0.22), (0.50, 0.26, 0.20), (0.62, 0.36, 0.26))
     return {
-        "brick": tx.courses(rng, brick, (0.66, 0.62, 0.56), 14, 7, size=SIZE),
-        "stone": tx.courses(rng, block, (0.5, 0.47, 0.42), 6, 4, gap=0.03, size=SIZE),
-        "setts": tx.courses(rng, sett, (0.28, 0.26, 0.24), 10, 10, gap=0.08, size=SIZE),
-        "tiles": tx.courses(rng, tile, (0.22, 0.13, 0.10), 10, 8, spread=0.3, size=SIZE),
+        "brick": tx.courses(rng, BRICK, (0.66, 0.62, 0.56), 14, 7, size=SIZE),
+        "stone": tx.courses(rng, BLOCK, (0.5, 0.47, 0.42), 6, 4, gap=0.03, size=SIZE),
+        "setts": tx.courses(rng, SETT, (0.28, 0.26, 0.24), 10, 10, gap=0.08, size=SIZE),
+        "tiles": tx.courses(rng, TILE, (0.22, 0.13, 0.10), 10, 8, spread=0.3, size=SIZE),
         "plaster": tx.plaster(rng, (0.86, 0.85, 0.82), size=SIZE),
         "paint": tx.plaster(rng, (0.9, 0.9, 0.9), rough=0.08, size=SIZE),
         "asphalt": tx.plaster(rng, (0.42, 0.42, 0.43), rough=0.2, size=SIZE),

@@ -47,7 +47,7 @@ class Batch(NamedTuple):
 
 
 def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list[PosedPhoto]:
-    """The images that are not held out, in their order.
+    """The images that are not held out, in their order; pixels that no ray leads to are not kept.
 
     UserError when there is none, or nothing between ``near`` and ``far``, or more than 32 bits can tell apart.
     """
@@ -65,7 +65,7 @@ def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list
         PosedPhoto(
             image.record.name,
             image.rgb,
-            image.keep_mask,
+            image.keep_mask & ~image.view.without_ray(),
             image.view.cam_from_world,
             image.view.intrinsics,
             near,

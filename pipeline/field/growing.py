@@ -77,10 +77,7 @@ class GrowingField:
 
         `shards`, `threads` and `rate` as in :func:`pipeline.field.fit.fit`.
         """
-        images = [
-            replace(image, keep_mask=~(drop_masks[image.record.name] | image.view.without_ray()))
-            for image in self.images
-        ]
+        images = [replace(image, keep_mask=~drop_masks[image.record.name]) for image in self.images]
         seed = self.seed + len(self.psnr)
         with tqdm(total=steps, desc="brief fit", unit="step", leave=False) as bar:
 

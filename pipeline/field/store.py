@@ -20,7 +20,7 @@ from pipeline.field.buffer import PosedPhoto
 from pipeline.field.grid_field import GridField
 from pipeline.field.model import describe, restore
 from pipeline.field.paper_field import PaperField
-from pipeline.io.atomic import read_json, write_json
+from pipeline.io.atomic import clear_torn, read_json, write_json
 from pipeline.io.code import code_key
 from pipeline.io.tensors import load_tensors, save_tensors
 
@@ -105,8 +105,7 @@ class Checkpoint:
 
     def load(self, device: str = "cpu") -> tuple[int, dict[str, Tensor]] | None:
         """Step and state of this very fit, if it was interrupted; what a kill left of a save is gone."""
-        for torn in self.file.parent.glob(f".{self.file.name}.tmp-*"):
-            torn.unlink(missing_ok=True)
+        clear_torn(self.file)
         if not self.file.is_file():
             return None
         try:

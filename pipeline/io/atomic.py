@@ -141,6 +141,12 @@ def _beside(path: Path, data: bytes) -> Iterator[Path]:
             fresh.unlink(missing_ok=True)
 
 
+def clear_torn(path: Path) -> None:
+    """What writers of `path` that were killed left beside it is gone; nobody else may be writing it."""
+    for torn in path.parent.glob(f".{path.name}.tmp-*"):
+        torn.unlink(missing_ok=True)
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Writes `data` to `path`: beside it first, flushed to disk, then renamed."""
     with _beside(path, data) as fresh:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import torch
 
-from pipeline.io.atomic import write_bytes
+from pipeline.io.atomic import clear_torn, write_bytes
 from pipeline.io.code import code_key
 
 Rows = list[list[float | str]]
@@ -54,8 +54,10 @@ def save_checkpoint(path: Path, trainer: Resumable, rows: Rows) -> None:
 def load_checkpoint(path: Path, trainer: Resumable) -> Rows:
     """Takes the trainer back to where it was saved; the curve's rows so far.
 
-    Without a file there are none, and the trainer stays as it is; a damaged one counts as none.
+    Without a file there are none, and the trainer stays as it is; a damaged one counts as none. What a kill
+    left of a save is gone.
     """
+    clear_torn(path)
     if not path.is_file():
         return []
     try:

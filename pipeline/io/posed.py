@@ -36,9 +36,9 @@ def read_posed_images(
 ) -> list[PosedImage]:
     """The images that have a pose, in name order, held-out ones included.
 
-    Without a folder of `keep_masks` every pixel is kept, but for those that no ray leads to. UserError
-    when none has a pose, when a file is missing or damaged, or when the memory that is free cannot
-    hold what a fit of them holds: `held_bytes` per pixel.
+    Without a folder of `keep_masks` every pixel is kept. UserError when none has a pose, when a file is
+    missing or damaged, or when the memory that is free cannot hold what a fit of them holds: `held_bytes`
+    per pixel.
     """
     records = posed_records(images, views)
     _refuse_too_large(records, held_bytes)
@@ -49,7 +49,7 @@ def read_posed_images(
         keep_mask = np.ones(rgb.shape[:2], bool)
         if keep_masks is not None:
             keep_mask = read_keep_mask(keep_masks / record.name, (view.width, view.height))
-        found.append(PosedImage(record, view, rgb, keep_mask & ~view.without_ray()))
+        found.append(PosedImage(record, view, rgb, keep_mask))
     return found
 
 

@@ -23,9 +23,8 @@ from pipeline.io.atomic import read_json, write_json
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 Place = tuple[float, float, float]
 ORIGIN: Place = (0.0, 0.0, 0.0)
-MOST_FOLDED = (
-    0.145  # -k1 r^2 in the picture up to which a ray leads there (`pipeline.geometry.rays`)
-)
+# -k1 r^2 in the picture up to which a ray leads there: that of `pipeline.geometry.rays`, which reads no files.
+MOST_FOLDED = 0.145
 FAR_OFF = 1e4  # units from the origin up to which poses stay: 32 bits know these to a thousandth
 
 

@@ -203,7 +203,7 @@ def test_the_shape_network(half: bool, close: float) -> None:
 @pytest.mark.parametrize("step", [0, 200])
 @pytest.mark.parametrize("space", [NDC, BALL])
 def test_a_whole_step(space: Space, step: int) -> None:
-    """Of the later one the rays farthest off have no part."""
+    """The same losses and gradients; rays farthest off are left out of the later step alone."""
     rays = some_rays()
     observed, none = torch.rand(R, 3, generator=source(3)), torch.zeros(R)
     results = []

@@ -114,6 +114,7 @@ def test_a_fit_is_as_long_as_its_seconds_allow(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
     settings = yaml.safe_load((quality.ROOT / "params.yaml").read_text())["nerf"]
     settings |= {"levels": 1, "table_log2": 10, "resolution": 32}
-    row = budget.measure(nine({}, np.full((4, 6), 3.0, np.float32)), "clean", 60.0, 1, settings)
+    wall = nine({}, np.full((4, 6), 3.0, np.float32))
+    row = budget.measure(wall, "clean", 60.0, 1, settings, seen_pixels(wall, {}))
     assert (row.steps, row.seconds) == (240, 60.0)
     assert row.psnr == pytest.approx(row.seen) and np.isfinite(row.psnr)

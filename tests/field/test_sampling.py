@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,9 @@ from pipeline.field.sampling import (
     invert_pieces,
     stratified,
 )
+from pipeline.io.posed import PosedImage
+from pipeline.io.scene import ImageRecord
+from pipeline.io.transforms import View
 
 
 def test_depth_is_linear_in_its_inverse() -> None:
@@ -62,3 +66,14 @@ def test_intervals_enclose_their_samples() -> None:
 def test_depths_that_cannot_be_told_apart_are_refused(near: float, far: float) -> None:
     with pytest.raises(UserError, match="depth"):
         photos_to_fit([], near, far)
+
+
+def test_pixels_that_no_ray_leads_to_are_not_fitted() -> None:
+    view = View("a.png", np.eye(4), 4.0, 4.0, 4.0, 3.0, -0.2, 8, 6, 1.0, 9.0)
+    record = ImageRecord("a.png", "a.jpg", "", 8, 6, None, "train", 0)
+    keep_mask = np.ones((6, 8), bool)
+    keep_mask[3, 4] = False
+    image = PosedImage(record, view, np.zeros((6, 8, 3), np.float32), keep_mask)
+    (photo,) = photos_to_fit([image], 1.0, 9.0)
+    assert not photo.keep_mask[0, 0] and not photo.keep_mask[3, 4] and photo.keep_mask[2, 4]
+    assert np.array_equal(photo.keep_mask, keep_mask & ~view.without_ray())
