@@ -101,6 +101,8 @@ def run(
     if stage is not None:
         params_type, main = stage.Params, stage.main
     try:
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # `stages` left at once so far
         parser = _parser(name, sys.modules["__main__"].__doc__ or "")
         if add_flags is not None:
             add_flags(parser)

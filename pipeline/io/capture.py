@@ -5,13 +5,15 @@ from __future__ import annotations
 import filecmp
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import filelock
+
 from pipeline.errors import UserError
-from pipeline.io.atomic import publish_dir, read_json
+from pipeline.io.atomic import disk_faults, publish_dir, read_json
 from pipeline.io.given import GivenView, read_nerfstudio
 from pipeline.io.images import PHOTO_SUFFIXES
 from pipeline.io.llff import read_poses_bounds
@@ -23,6 +25,7 @@ POSES_BOUNDS = "poses_bounds.npy"
 RAIN_MASK = "rainMask.npy"
 MASKS = "masks"
 TRUTH = "truth"
+CLUTTER = frozenset({"Thumbs.db", "desktop.ini"})  # of file managers; hidden files are too
 COLMAP_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 ColmapReader = Callable[[Path, Sequence[Path]], list[GivenView]]
 
@@ -200,22 +203,58 @@ def adopt(source: Path, data: Path, at_least: int, read_colmap: ColmapReader) ->
         root, files = source, _belonging(source, capture)
     else:
         raise UserError(f"{source} is no folder and no video.", "Name the folder of your photos.")
-    if data.exists():
-        _refuse_other(data, root, files)
-        return
+    _refuse_unnamable(files)
+    with _alone(data):
+        if data.exists():
+            if not data.samefile(root):  # else what lies beside the capture stays there
+                _refuse_other(data, root, files)
+            return
+        _copy(source, root, files, data)
+
+
+@contextmanager
+def _alone(data: Path) -> Iterator[None]:
+    """Nobody else brings photos to `data` meanwhile: a second run would clear the first one's copies away."""
+    try:
+        with disk_faults(data):
+            data.parent.mkdir(parents=True, exist_ok=True)
+            lock = filelock.FileLock(data.parent / f".{data.name}.lock", timeout=0).acquire()
+    except filelock.Timeout:
+        raise UserError(
+            f"photos are being copied to {data} already.", "Wait for that run, or end it first."
+        ) from None
+    with lock:
+        yield
+
+
+def _copy(source: Path, root: Path, files: Iterable[Path], data: Path) -> None:
     with publish_dir(data) as fresh:
+        for folder in sorted({path.relative_to(root).parent for path in files}):
+            (fresh / folder).mkdir(parents=True, exist_ok=True)
         for path in files:
-            target = fresh / path.relative_to(root)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
+            shutil.copyfile(path, fresh / path.relative_to(root))
         if (source / TRUTH).is_dir():
             _copy_folder(source / TRUTH, fresh / TRUTH)
+
+
+def _refuse_unnamable(files: Iterable[Path]) -> None:
+    """UserError for a name that is not UTF-8: DVC cannot list the folder it lies in."""
+    for path in files:
+        try:
+            str(path.name).encode()
+        except UnicodeEncodeError:
+            shown = os.fsencode(path).decode(errors="backslashreplace")
+            raise UserError(f"{shown}: the name is not UTF-8.", "Rename the file.") from None
 
 
 def _refuse_other(data: Path, root: Path, files: Iterable[Path]) -> None:
     """UserError unless `data` holds these files of `root`, byte for byte, and nothing besides its truth."""
     wanted = {path.relative_to(root): path for path in files}
-    held = {path.relative_to(data): path for path in data.rglob("*") if path.is_file()}
+    held = {
+        path.relative_to(data): path
+        for path in data.rglob("*")
+        if path.is_file() and not path.name.startswith(".") and path.name not in CLUTTER
+    }
     same = wanted.keys() == {path for path in held if path.parts[0] != TRUTH}
     if not same or not all(filecmp.cmp(path, held[p], shallow=False) for p, path in wanted.items()):
         raise UserError(

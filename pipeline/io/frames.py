@@ -197,7 +197,8 @@ def _told_seconds(path: Path) -> float:
 def _grey(frame: av.VideoFrame, longest: int) -> np.ndarray:
     factor = min(1.0, longest / max(frame.width, frame.height))
     width, height = (max(2, round(side * factor)) for side in (frame.width, frame.height))
-    return frame.reformat(width=width, height=height, format="gray").to_ndarray()
+    picture = frame.reformat(width=width, height=height, format="gray").to_ndarray()
+    return np.ascontiguousarray(picture)  # a view of padded rows where the width asks for padding
 
 
 def _median_flow(last: np.ndarray, now: np.ndarray) -> float:

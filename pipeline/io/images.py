@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +19,9 @@ from pipeline.io.atomic import write_bytes
 PHOTO_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".jfif", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif"}
 )
+# Pillow goes by what is in a file, whatever its name: a drawing in PostScript would be run by Ghostscript.
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF")
+OPTIONAL = {".avif": ("AVIF",), ".heic": ("HEIF",), ".heif": ("HEIF",)}
 MAX_PIXELS = 200_000_000
 # Pillow's own limit is 179 million, fewer than some phones' photos have; MAX_PIXELS is told in words.
 Image.MAX_IMAGE_PIXELS = None
@@ -84,17 +87,24 @@ def write_image(path: Path, rgb: np.ndarray) -> None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of the stored pixels, from the file's header; OSError when it tells none or too many."""
-    can_read(path.suffix.lower())  # registers what reads HEIC, once in every process
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path) as photo:
+            with Image.open(path, formats=_formats()) as photo:
                 width, height = photo.size
-    except (SyntaxError, ValueError) as error:
+    except (SyntaxError, ValueError, RuntimeError, EOFError) as error:
         raise OSError(str(error)) from error
     if width * height > MAX_PIXELS:
         raise OSError(f"{path} claims {width}x{height} pixels")
     return width, height
+
+
+@cache
+def _formats() -> tuple[str, ...]:
+    """The formats that photos are read in here, registered once in every process."""
+    return FORMATS + tuple(
+        {kind for end, kinds in OPTIONAL.items() if can_read(end) for kind in kinds}
+    )
 
 
 @cache
@@ -115,18 +125,21 @@ def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
     Grey, palette, RGBA (over black), CMYK, 16-bit and grey float files are converted to 8-bit RGB. UserError
     for what is not an image, is cut short, or has more than MAX_PIXELS.
     """
-    can_read(path.suffix.lower())  # registers what reads HEIC, once in every process
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path) as photo:
+            with Image.open(path, formats=_formats()) as photo:
                 if photo.width * photo.height > MAX_PIXELS:
                     raise UserError(
                         f"{path} has {photo.width}x{photo.height} pixels.",
                         f"At most {MAX_PIXELS:,} are read; scale it down.",
                     )
                 photo.load()
-                return _sensor_pixels(photo), _photo_info(photo)
+                pixels, info = _sensor_pixels(photo), _photo_info(photo)
+                if photo.format == "HEIF":  # decoded upright, whatever EXIF says beside
+                    info = replace(info, upright_turn=_heif_turn(path))
+                    pixels = turn(pixels, -info.upright_turn)
+                return pixels, info
     except UserError:
         raise
     except UnidentifiedImageError:
@@ -137,10 +150,18 @@ def read_photo(path: Path) -> tuple[np.ndarray, PhotoInfo]:
         raise UserError(
             f"{path} cannot be read ({error.strerror}).", "Check its permissions."
         ) from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise UserError(
+    except (OSError, SyntaxError, ValueError, RuntimeError, EOFError) as error:
+        raise UserError(  # the last two come from the libraries that read AVIF and HEIC
             f"{path} is damaged or cut short ({error}).", "Copy it again, or remove it."
         ) from None
+
+
+def _heif_turn(path: Path) -> int:
+    """Degrees counter-clockwise by which a HEIC's decoder turns what the sensor saw: its property `irot`."""
+    with path.open("rb") as file:
+        head = file.read(1 << 20)  # properties stand before the pictures
+    at = head.find(b"\0\0\0\x09irot")
+    return 0 if at < 0 else head[at + 8] % 4 * 90
 
 
 def _sensor_pixels(photo: Image.Image) -> np.ndarray:

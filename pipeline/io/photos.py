@@ -159,8 +159,8 @@ def plan_sizes(
 ) -> Plan:
     """How to turn and scale the photos so that all have one size.
 
-    Upright where that gives one size. Where upright photos would mix portrait and landscape, all get the
-    turn that most of them ask for: drops fixed to the lens then keep their place in the frame. Sizes
+    All get the turn that most of them ask for: drops fixed to the lens then keep their place in the frame.
+    Each is made upright by itself only where that gives one size and the common turn does not. Sizes
     that still differ are scaled to the smallest where their shapes agree; otherwise the photos of the
     most common shape are used and the others left out, as long as they are half of all. UserError when
     they are not, or when sizes differ and `mixed` is "refuse". `fixed_turns` leaves no choice of turns:
@@ -179,7 +179,7 @@ def plan_sizes(
             f"{', '.join(Path(name).stem for name in copies)}"
         )
         return replace(plan, left_out=sorted([*plan.left_out, *copies]), said=[said, *plan.said])
-    choices, why = _choices_of_turns(photos), "so that portrait and landscape have one size"
+    choices, why = _choices_of_turns(photos), "so that drops on the lens keep their place"
     if fixed_turns is not None:
         choices, why = [dict(fixed_turns)], "as the cameras that came along see them"
     for turns in choices:
@@ -187,20 +187,20 @@ def plan_sizes(
         if len(sizes) == 1:
             return Plan(turns, sizes.pop(), [], _said_of_turns(photos, turns, why))
     if mixed == "refuse":
-        raise _mixed_sizes(photos, choices[-1])
+        raise _mixed_sizes(photos, choices[0])
     plans = [_scaled_together(photos, turns, why) for turns in choices]
     best = min(plans, key=lambda plan: len(plan.left_out))
     if 2 * len(best.left_out) > len(photos):
-        raise _mixed_sizes(photos, choices[-1])
+        raise _mixed_sizes(photos, choices[0])
     return best
 
 
 def _choices_of_turns(photos: Mapping[str, Photo]) -> list[dict[str, int]]:
-    """Upright, then the turn that most photos ask for, given to all."""
+    """The turn that most photos ask for, given to all, then each upright."""
     upright = {name: photo.upright_turn for name, photo in photos.items()}
     most = Counter(upright.values()).most_common()
     common = min(degrees for degrees, count in most if count == most[0][1])
-    return [upright, dict.fromkeys(photos, common)]
+    return [dict.fromkeys(photos, common), upright]
 
 
 def _said_of_turns(photos: Mapping[str, Photo], turns: Mapping[str, int], why: str) -> list[str]:

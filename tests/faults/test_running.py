@@ -115,6 +115,24 @@ pipeline.stage.run("masks", Params, main)
 """
 
 
+@pytest.mark.parametrize("stage", ["masks", "nerf"])
+def test_interrupted_while_it_loads(stage: str) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", "-m", f"stages.{stage}", "--scene", SCENE],
+        cwd=project.ROOT, stderr=subprocess.PIPE, text=True, preexec_fn=_hear_interrupts,
+    )  # fmt: skip
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.rstrip().endswith("numpy.version"):  # in the midst of it
+            process.send_signal(signal.SIGINT)
+            break
+    said = process.communicate(timeout=60)[1].splitlines()
+    assert process.returncode == 130
+    assert [line for line in said if not line.startswith("import time")] == [
+        "interrupted before anything was done"
+    ]
+
+
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no timers")
 def test_a_stage_told_to_end_in_a_callback_from_c_is_told_again(whole: Workshop) -> None:
     params = ["--scene", SCENE, "--params", str(whole.root / "params.yaml")]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -364,6 +367,49 @@ def test_a_scene_is_only_brought_in_again_when_it_is_the_same(tmp_path: Path, ch
     assert {path: path.read_bytes() for path in data.iterdir()} == before
 
 
+def test_what_lies_beside_the_capture_does_not_make_it_another(tmp_path: Path) -> None:
+    data = tmp_path / "data/garden"
+    _photos(data)
+    (data / "notes.txt").write_text("taken in May")
+    adopt(data, data, 3, _no_colmap)  # the folder itself, as the README's FROM=data/garden
+    source = tmp_path / "capture"
+    _photos(source)
+    (data / "notes.txt").unlink()
+    for clutter in (".DS_Store", "Thumbs.db", f"._{NAMES[0]}"):
+        (data / clutter).touch()
+    adopt(source, data, 3, _no_colmap)
+
+
+def test_two_runs_do_not_bring_photos_to_one_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second would clear away what the first has copied so far."""
+    source, data = tmp_path / "capture", tmp_path / "data/garden"
+    _photos(source)
+    copy, told = shutil.copyfile, []
+
+    def meanwhile(path: Path, target: Path) -> None:
+        with pytest.raises(UserError, match=r"are being copied to .*garden already") as error:
+            adopt(source, data, 3, _no_colmap)
+        told.append(error)
+        copy(path, target)
+
+    monkeypatch.setattr("pipeline.io.capture.shutil.copyfile", meanwhile)
+    adopt(source, data, 3, _no_colmap)
+    assert len(told) == len(NAMES)
+    assert sorted(path.name for path in data.iterdir()) == list(NAMES)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf8_are_told(tmp_path: Path) -> None:
+    source = tmp_path / "capture"
+    _photos(source)
+    (source / NAMES[0]).rename(os.fsdecode(os.fsencode(source) + b"/caf\xe9.jpg"))
+    with pytest.raises(UserError, match=r"caf\\xe9\.jpg: the name is not UTF-8"):
+        adopt(source, tmp_path / "data/garden", 3, _no_colmap)
+    assert not (tmp_path / "data/garden").exists()
+
+
 def test_a_tilde_that_no_shell_has_expanded_is_the_home_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -461,7 +507,7 @@ def test_links_to_nowhere_are_not_left_out_of_a_copy(tmp_path: Path, place: str)
     link.symlink_to("/absent")
     with pytest.raises(UserError, match=re.escape(str(link))):
         adopt(source, data, 3, _no_colmap)
-    assert not data.exists() and [path.name for path in data.parent.glob(".*")] == []
+    assert not data.exists() and list(data.parent.glob(".*tmp-*")) == []
 
 
 def test_archives_and_headers_that_lie_are_no_arrays(tmp_path: Path) -> None:

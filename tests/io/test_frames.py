@@ -70,6 +70,15 @@ def test_a_phone_held_upright_gives_upright_frames(video: Path, tmp_path: Path) 
     assert np.abs(pixels - expected).mean() < 10
 
 
+@pytest.mark.parametrize("width, height", [(90, 160), (120, 160), (160, 160)])
+def test_videos_stored_upright_are_read(tmp_path: Path, width: int, height: int) -> None:
+    pictures = [np.ascontiguousarray(frame[:height, :width]) for frame in _pan()[1]]
+    tall = [np.pad(p, ((0, height - len(p)), (0, 0), (0, 0)), "reflect") for p in pictures]
+    write_video(tmp_path / "tall.mp4", tall, 25)
+    picked = pick_frames(tmp_path / "tall.mp4", 5).frames
+    assert len(picked) == 5
+
+
 def test_saved_frames_are_numbered_and_tell_their_time(video: Path, tmp_path: Path) -> None:
     records, said = save_frames(video, tmp_path, 5, 160)
     assert said == []

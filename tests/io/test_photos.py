@@ -69,12 +69,43 @@ def test_portrait_and_landscape_of_one_camera_get_one_size(tmp_path: Path) -> No
     plan = plan_sizes(photos)
     assert plan.turns == {"a.jpg": 0, "b.jpg": 0, "c.jpg": 0}, "all in the frame of the sensor"
     assert (plan.size, plan.left_out) == ((40, 30), [])
-    assert plan.said == ["1 of 3 photos stay turned, so that portrait and landscape have one size"]
+    assert plan.said == ["1 of 3 photos stay turned, so that drops on the lens keep their place"]
     portraits = {
         name: examine(_photo(tmp_path / name, orientation=6)) for name in ("d.jpg", "e.jpg")
     }
     plan = plan_sizes(portraits)
     assert set(plan.turns.values()) == {270}, "all portrait: upright"
+    assert (plan.size, plan.said) == ((30, 40), [])
+
+
+@pytest.mark.parametrize(
+    "size, orientations, common",
+    [((40, 30), (1, 1, 1, 3), 0), ((40, 30), (6, 6, 8), 270), ((30, 30), (1, 6, 1), 0)],
+)
+def test_photos_that_fit_either_way_stay_in_the_frame_of_the_sensor(
+    tmp_path: Path, size: tuple[int, int], orientations: tuple[int, ...], common: int
+) -> None:
+    """Made upright, they would have one size too, but a drop on the lens two places."""
+    photos = {
+        f"{n}.jpg": examine(_photo(tmp_path / f"{n}.jpg", size, orientation=orientation))
+        for n, orientation in enumerate(orientations)
+    }
+    plan = plan_sizes(photos)
+    assert set(plan.turns.values()) == {common}
+    assert plan.said == [
+        f"1 of {len(photos)} photos stay turned, so that drops on the lens keep their place"
+    ]
+
+
+def test_photos_that_only_fit_upright_are_made_so(tmp_path: Path) -> None:
+    """One was turned by a program, its pixels and all."""
+    photos = {
+        "a.jpg": examine(_photo(tmp_path / "a.jpg", (40, 30), orientation=6)),
+        "b.jpg": examine(_photo(tmp_path / "b.jpg", (40, 30), orientation=6)),
+        "c.jpg": examine(_photo(tmp_path / "c.jpg", (30, 40))),
+    }
+    plan = plan_sizes(photos)
+    assert plan.turns == {"a.jpg": 270, "b.jpg": 270, "c.jpg": 0}
     assert (plan.size, plan.said) == ((30, 40), [])
 
 
@@ -119,12 +150,54 @@ def test_what_is_transparent_is_black(tmp_path: Path) -> None:
     assert read[:, :4].max() == 0 and read[:, 4:].min() == 255
 
 
-def test_heic_and_avif_are_read_where_the_packages_are(tmp_path: Path) -> None:
-    for name in ("a.heic", "b.avif"):
-        if not can_read(Path(name).suffix):
-            continue
-        Image.new("RGB", (64, 48), "white").save(tmp_path / name)
-        assert examine(tmp_path / name).size_after(0) == (64, 48)
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_photos_of_phones_come_as_the_sensor_saw_them(tmp_path: Path, suffix: str) -> None:
+    """Whoever decodes them turns some upright unasked: a drop on the lens would have two places."""
+    if not can_read(suffix):
+        pytest.skip(f"{suffix} needs another package")
+    rng = np.random.default_rng(0)
+    seen = np.repeat(np.repeat(rng.integers(0, 256, (6, 8, 3), np.uint8), 8, 0), 8, 1)
+    for orientation, degrees in ((1, 0), (3, 180), (6, 270), (8, 90)):
+        exif = Image.Exif()
+        exif[ORIENTATION] = orientation
+        path = tmp_path / f"{orientation}{suffix}"
+        Image.fromarray(seen).save(path, quality=95, exif=exif.tobytes())
+        pixels, info = read_photo(path)
+        assert info.upright_turn == degrees
+        assert pixels.shape == seen.shape
+        assert np.abs(pixels.astype(int) - seen).mean() < 12
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_damaged_photos_of_phones_are_told(tmp_path: Path, suffix: str) -> None:
+    if not can_read(suffix):
+        pytest.skip(f"{suffix} needs another package")
+    rng = np.random.default_rng(1)
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(rng.integers(0, 256, (48, 64, 3), np.uint8)).save(path)
+    whole, refused = path.read_bytes(), 0
+    for _ in range(150):
+        data = bytearray(whole)
+        for place in rng.integers(0, len(data), 6):
+            data[place] = rng.integers(256)
+        path.write_bytes(data)
+        try:
+            read_photo(path)
+        except UserError:
+            refused += 1
+    assert refused > 10
+
+
+def test_a_drawing_called_a_photo_is_not_run(tmp_path: Path) -> None:
+    """Pillow would hand PostScript to Ghostscript: here it would never end."""
+    path = tmp_path / "a.jpg"
+    path.write_text(
+        "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n{ } loop\n%%EOF\n"
+    )
+    with pytest.raises(UserError, match=r"a\.jpg is not an image"):
+        read_photo(path)
+    with pytest.raises(OSError):
+        image_size(path)
 
 
 def test_heic_without_its_package_names_the_remedy(
@@ -161,7 +234,7 @@ def test_grey_floats_between_0_and_1_are_no_black_photo(tmp_path: Path) -> None:
 def test_a_photo_that_may_not_be_read_is_not_called_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def forbidden(path: Path) -> None:
+    def forbidden(path: Path, **options: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Image, "open", forbidden)
