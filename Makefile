@@ -4,7 +4,7 @@ SCENE ?= demo
 BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 
-.PHONY: demo test check format setup scene tables report synth clean
+.PHONY: demo test check format setup scene tables clean
 
 demo: setup
 	dvc repro report@demo

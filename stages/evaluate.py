@@ -54,6 +54,11 @@ def main(job: Job, params: Params) -> str:
         len(records),
         _without(job, "true cameras", truth),
     )
+    held_out = [record.name for record in records if record.split == "test"]
+    metrics["judged"] = {
+        "held_out": held_out,
+        "views": [name for name in held_out if files[name].test],
+    }
     metrics["rounds"] = score_rounds(paths.refine, files, params.coverage_threshold)
     metrics["conventions"] = conventions(params.coverage_threshold)
     table = {record.name: {"split": record.split, **rows[record.name]} for record in records}

@@ -73,7 +73,8 @@ def main(job: Job, params: Params) -> str:
         intake=read_origin(paths.images).said,
         video=film,
         video_missing=film_missing,
-        missing=numbers.missing(metrics) + unmet,
+        placing_known=bool(account),
+        missing=numbers.missing(metrics) + numbers.incomparable(metrics, other) + unmet,
         conventions=metrics.get("conventions", {}),
     )
     with publish_dir(paths.report) as fresh:

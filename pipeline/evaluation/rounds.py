@@ -44,7 +44,7 @@ def _round(folder: Path, files: Iterable[Files], threshold: float) -> dict[str, 
                 counts.append(mask_counts(drop_mask, coverage, threshold))
         if view.is_file() and one.clean is not None:
             clean = read_reference(one.clean, one.record, one.source)
-            psnrs.append(psnr(read_image(view, "refine"), clean))
+            psnrs.append(psnr(read_image(view, "refine", one.record.size), clean))
     found = {"coverage": float(np.mean(shares))} if shares else {}
     scores = mask_scores(counts)._asdict() if counts else {}
     found |= {name: value for name, value in scores.items() if math.isfinite(value)}

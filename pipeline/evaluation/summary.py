@@ -11,6 +11,7 @@ from typing import Any
 from pipeline.evaluation import flip, lpips
 from pipeline.evaluation.image import WINDOW_RADIUS
 from pipeline.evaluation.masks import MaskCounts, mask_scores
+from pipeline.io.accounts import judged
 
 Rows = Mapping[str, Mapping[str, float]]
 
@@ -86,7 +87,7 @@ def conventions(coverage_threshold: float) -> dict[str, Any]:
         "lpips_net": lpips.NET,
         "mask_threshold": coverage_threshold,
         "psnr": "mean over images of the PSNR of the selected pixels, RGB",
-        "ssim": "Gaussian window, sigma 1.5, 11 pixels, RGB",
+        "ssim": "Gaussian window, sigma 1.5, 11 pixels, RGB, mean over windows wholly inside the picture",
     }
 
 
@@ -100,7 +101,8 @@ def headline(metrics: Mapping[str, Any]) -> str:
         agreement = "" if kept is None else f"; {kept:.2f} dB against the photos beside the drops"
         return f"{found}{agreement}; no PSNR of clean views: {reason}"
     iou = "" if masks["iou"] is None else f", mask IoU {masks['iou']:.3f}"
-    view = f"held-out views {metrics['test']['psnr']:.2f} dB, SSIM {metrics['test']['ssim']:.3f}"
+    test = metrics["test"]
+    view = f"held-out views{judged(metrics)} {test['psnr']:.2f} dB, SSIM {test['ssim']:.3f}"
     return f"{view}{iou}, {found}"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.io.accounts import read_metrics
+from pipeline.io.accounts import look_up, read_metrics, unlike
 
 # Heading, dotted name, format. Higher is better but for LPIPS and FLIP.
 COLUMNS = (
@@ -27,22 +27,6 @@ COLUMNS = (
 )
 MISSING = "-"
 LIKE_THE_ONE_BEFORE = {"composite.ssim": "composite SSIM"}  # headings that say too little alone
-# Where fits differ in the first of these, their numbers of the others are means over other pixels or photos.
-UNLIKE = (
-    (
-        "masks.coverage",
-        ("covered.psnr", "kept.psnr", "selfcheck.kept_psnr"),
-        "masks differ",
-        "pixels",
-    ),
-    ("input.psnr", ("composite.psnr", "composite.ssim", "input.psnr"), "photos differ", "photos"),
-)
-
-
-def look_up(metrics: Mapping[str, Any], name: str) -> float | None:
-    """The number at a dotted name, or None."""
-    group, leaf = name.split(".")
-    return metrics.get(group, {}).get(leaf)
 
 
 def reasons(metrics: Mapping[str, Any]) -> dict[str, str]:
@@ -78,12 +62,16 @@ def table(fits: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def gains(fits: Mapping[str, Mapping[str, Any]]) -> str:
-    """How far the first fit is ahead of each other, in dB on held-out views; empty if unknown."""
+    """How far the first fit is ahead of each other, in dB on held-out views; empty if unknown.
+
+    So it is of fits that were judged on other views.
+    """
     (first, metrics), *others = fits.items()
     own, lines = look_up(metrics, "test.psnr"), []
     for label, other in others:
         theirs = look_up(other, "test.psnr")
-        if own is not None and theirs is not None:
+        same = all("test.psnr" not in those.names for those in unlike([metrics, other]))
+        if own is not None and theirs is not None and same:
             lines.append(f"{first} over {label}: {own - theirs:+.2f} dB on held-out views.\n")
     return "".join(lines)
 
@@ -115,14 +103,16 @@ def _line(row: Sequence[str], widths: Sequence[int]) -> str:
 def _unlike(fits: Mapping[str, Mapping[str, Any]]) -> list[str]:
     told = {name: LIKE_THE_ONE_BEFORE.get(name, heading) for heading, name, _ in COLUMNS}
     lines = []
-    for ruler, names, why, what in UNLIKE:
+    for names, why, what in unlike(list(fits.values())):
         known = [
-            name for name in names if sum(look_up(f, name) is not None for f in fits.values()) > 1
+            told[name]
+            for name in names
+            if name in told and sum(look_up(fit, name) is not None for fit in fits.values()) > 1
         ]
-        values = {look_up(fit, ruler) for fit in fits.values()} - {None}
-        if known and len(values) > 1:
-            headings = ", ".join(told[name] for name in known)
-            lines.append(f"The fits' {why}: each is judged on {what} of its own in {headings}.")
+        if known:
+            lines.append(
+                f"The fits' {why} differ: each is judged on {what} of its own in {', '.join(known)}."
+            )
     return lines
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pipeline.io.atomic import read_json
 from pipeline.io.shapes import Shape
@@ -70,9 +71,61 @@ METRICS: Shape = {
         )
     },
     "poses": {**_GROUP, "registered": int, "total": int, "unit?": str},
+    "judged?": {"held_out": list[str], "views": list[str]},
     "rounds?": dict[int, dict[str, float]],
     "conventions": {"mask_threshold": float},
 }
+
+
+class Unlike(NamedTuple):
+    """Numbers, by dotted names, that two fits' `why` (they differ) makes means over other `what`."""
+
+    names: tuple[str, ...]
+    why: str
+    what: str
+
+
+# By the number or list that tells whether fits are alike in it.
+_UNLIKE = {
+    "judged.views": Unlike(
+        ("test.psnr", "test.ssim", "test.lpips", "test.flip", "covered.psnr", "kept.psnr",
+         "selfcheck.kept_psnr"),
+        "held-out views", "views",
+    ),
+    "masks.coverage": Unlike(
+        ("covered.psnr", "kept.psnr", "selfcheck.kept_psnr", "composite.covered_psnr", "input.covered_psnr"),
+        "masks", "pixels",
+    ),
+    "input.psnr": Unlike(
+        ("composite.psnr", "composite.ssim", "composite.covered_psnr", "input.psnr", "input.ssim",
+         "input.covered_psnr"),
+        "photos", "photos",
+    ),
+}  # fmt: skip
+
+
+def look_up(metrics: Mapping[str, Any], name: str) -> Any:
+    """What stands at a dotted name, a number as a rule, or None."""
+    group, leaf = name.split(".")
+    return metrics.get(group, {}).get(leaf)
+
+
+def unlike(fits: Sequence[Mapping[str, Any]]) -> list[Unlike]:
+    """What of several fits' numbers cannot be compared, each judged on pixels, photos or views of its own."""
+    found = []
+    for ruler, those in _UNLIKE.items():
+        known = [look_up(fit, ruler) for fit in fits]
+        first, *others = [one for one in known if one is not None] or [None]
+        if any(one != first for one in others):
+            found.append(those)
+    return found
+
+
+def judged(metrics: Mapping[str, Any]) -> str:
+    """ " (2 of 3)" where not all held-out views were judged, for want of a pose or of a rendering; else ""."""
+    views = metrics.get("judged", {"views": [], "held_out": []})
+    here, all_of_them = len(views["views"]), len(views["held_out"])
+    return f" ({here} of {all_of_them})" if here < all_of_them else ""
 
 
 def read_metrics(path: Path) -> dict[str, Any]:

@@ -42,7 +42,7 @@ def _told(by: Any) -> str:
         return "its header is damaged"
 
 
-def _read(path: Path, made_by: str) -> np.ndarray:
+def _read(path: Path, made_by: str, size: tuple[int, int] | None) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path} does not exist.", f"Run `python -m stages.{made_by}` first.")
     file = oiio.ImageInput.open(str(path))
@@ -57,6 +57,11 @@ def _read(path: Path, made_by: str) -> np.ndarray:
     if not np.isfinite(pixels).all():
         raise UserError(
             f"{path} holds NaN or infinity.", f"Run `python -m stages.{made_by}` again."
+        )
+    if size is not None and pixels.shape[1::-1] != size:
+        raise UserError(
+            f"{path} is {pixels.shape[1]}x{pixels.shape[0]}, its image {size[0]}x{size[1]}.",
+            f"Run `python -m stages.{made_by}` again.",
         )
     return pixels[..., 0]
 
@@ -78,13 +83,7 @@ def read_map(
 
     So it is when the map is not of `size` (width, height), its image's.
     """
-    values = _read(path, made_by)
-    if size is not None and values.shape[::-1] != size:
-        raise UserError(
-            f"{path} is {values.shape[1]}x{values.shape[0]}, its image {size[0]}x{size[1]}.",
-            f"Run `python -m stages.{made_by}` again.",
-        )
-    return values
+    return _read(path, made_by, size)
 
 
 def write_depth(path: Path, depth: np.ndarray) -> None:
@@ -92,6 +91,8 @@ def write_depth(path: Path, depth: np.ndarray) -> None:
     _write(path, depth, "Z", "float", {})
 
 
-def read_depth(path: Path, made_by: str = "render") -> np.ndarray:
-    """An (H, W) float32 depth map; UserError when the file is missing or damaged."""
-    return _read(path, made_by)
+def read_depth(
+    path: Path, made_by: str = "render", size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """An (H, W) float32 depth map; UserError when the file is missing, damaged, or not of `size` (w, h)."""
+    return _read(path, made_by, size)

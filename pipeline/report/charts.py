@@ -12,17 +12,18 @@ Curve = Sequence[tuple[float, float]]
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 14, 28, 30
 _MOST_POINTS = 300
+ONE_WAY = (
+    0.5  # length of the mean of the directions that cameras look in, from which they look one way
+)
 
 
-def curves(
-    series: Mapping[str, Curve], *, title: str, unit: str, log: bool = False, size: tuple[int, int]
-) -> Markup:
-    """A line chart of named curves (x, y) with axes and a legend; `log` for a logarithmic y axis.
+def curves(series: Mapping[str, Curve], *, title: str, unit: str, size: tuple[int, int]) -> Markup:
+    """A line chart of named curves (x, y) with axes and a legend.
 
     size: (width, height) of the drawing in its own units; it scales with the page. Points that are
-    not finite, or not positive on a logarithmic axis, are left out.
+    not finite are left out.
     """
-    drawn = {label: _usable(curve, log) for label, curve in series.items()}
+    drawn = {label: _usable(curve) for label, curve in series.items()}
     points = [point for curve in drawn.values() for point in curve]
     if not points:
         return Markup("")
@@ -30,7 +31,7 @@ def curves(
     low, high = min(ys), max(ys)
     pad = 0.06 * (high - low) or 0.5
     frame = _Frame(min(xs), max(xs) or 1, low - pad, high + pad, size)
-    parts = [_axes(frame, log, unit), _legend(list(drawn))]
+    parts = [_axes(frame, unit), _legend(list(drawn))]
     for index, curve in enumerate(drawn.values()):
         path = " ".join(f"{frame.x(x):.1f},{frame.y(y):.1f}" for x, y in curve)
         parts.append(f'<polyline class="curve s{index}" points="{path}"/>')
@@ -46,7 +47,7 @@ def bars(
     if not known:
         return Markup("")
     frame = _Frame(0, len(names), 0, max(known) * 1.08 or 1, size)
-    parts, slot = [_axes(frame, False, unit, numbered=False)], 0.8 / len(series)
+    parts, slot = [_axes(frame, unit, numbered=False)], 0.8 / len(series)
     parts.append(_legend(list(series)))
     for index, (label, values) in enumerate(series.items()):
         for place, name in enumerate(names):
@@ -79,7 +80,7 @@ def camera_map(
     """The cameras from above: where each stands and looks, held-out ones in the second colour.
 
     cameras: `cam_from_world` (4, 4) by name. "Above" is against the mean of the cameras' downward
-    axes. `side`: seen from the right instead, up staying up.
+    axes. `side`: seen from the right instead, up staying up; where they look one way, it is marked.
     """
     if not cameras:
         return Markup("")
@@ -88,6 +89,7 @@ def camera_map(
     up = -stack[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up) or 1
     ahead = stack[:, :3, 2].mean(axis=0)
+    one_way = float(np.linalg.norm(ahead)) > ONE_WAY
     ahead = ahead - up * (ahead @ up)
     if np.linalg.norm(ahead) < 1e-6:  # they look all around
         ahead = np.cross(up, stack[0, :3, 0])
@@ -113,6 +115,9 @@ def camera_map(
             f'<g class="camera {kind}"><polygon points="{shape}"/>'
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2"/><title>{escape(name)}</title></g>'
         )
+    if side and one_way:
+        place = f'x="{size[0] - 10}" y="{size[1] - 8}"'
+        parts.append(f'<text class="tick" text-anchor="end" {place}>ahead →</text>')
     return _svg(parts, size, "Cameras seen from the side" if side else "Cameras seen from above")
 
 
@@ -133,27 +138,22 @@ class _Frame:
         return self.size[1] - _BOTTOM - share * (self.size[1] - _TOP - _BOTTOM)
 
 
-def _usable(curve: Curve, log: bool) -> list[tuple[float, float]]:
-    kept = [
-        (x, math.log10(y) if log else y)
-        for x, y in curve
-        if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log)
-    ]
+def _usable(curve: Curve) -> list[tuple[float, float]]:
+    kept = [(x, y) for x, y in curve if math.isfinite(x) and math.isfinite(y)]
     stride = math.ceil(len(kept) / _MOST_POINTS) or 1
     return kept[::stride] if stride == 1 else [*kept[::stride], kept[-1]]
 
 
-def _axes(frame: _Frame, log: bool, unit: str, numbered: bool = True) -> str:
+def _axes(frame: _Frame, unit: str, numbered: bool = True) -> str:
     width, height = frame.size
     parts = []
-    for value in (_decades if log else _round_steps)(frame.low, frame.high):
+    for value in _round_steps(frame.low, frame.high):
         y = frame.y(value)
-        label = f"{10**value:.4g}" if log else f"{value:g}"
         parts.append(
             f'<line class="grid" x1="{_LEFT}" x2="{width - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
         )
         parts.append(
-            f'<text class="tick" text-anchor="end" x="{_LEFT - 6}" y="{y + 3.5:.1f}">{label}</text>'
+            f'<text class="tick" text-anchor="end" x="{_LEFT - 6}" y="{y + 3.5:.1f}">{value:g}</text>'
         )
     if numbered:
         for value in _round_steps(frame.left, frame.right):
@@ -174,14 +174,6 @@ def _round_steps(low: float, high: float, wanted: int = 5) -> list[float]:
     step = next(base * m for m in (1, 2, 2.5, 5, 10) if base * m >= raw)
     first = math.ceil(low / step - 1e-9)
     return [round(i * step, 10) for i in range(first, math.floor(high / step + 1e-9) + 1)]
-
-
-def _decades(low: float, high: float) -> list[float]:
-    """Logarithms within [low, high] of 1, 2 and 5 times powers of ten; many: of the powers."""
-    powers = range(math.floor(low), math.ceil(high) + 1)
-    some = (1,) if high - low > 3 else (1, 2, 5)
-    logs = [power + math.log10(factor) for power in powers for factor in some]
-    return [value for value in logs if low <= value <= high]
 
 
 def _legend(labels: Sequence[str]) -> str:

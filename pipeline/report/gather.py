@@ -37,11 +37,11 @@ def photo_pictures(
     Kinds: photo, attention, mask, clean (the field's render), composite, depth, reference; those
     that do not exist are left out. UserError when a file is damaged.
     """
-    photo = read_image(paths.images / record.name)
+    photo = read_image(paths.images / record.name, size=record.size)
     found = {"photo": photo}
     attention = paths.attention / f"{record.stem}.exr"
     if attention.is_file():
-        found["attention"] = attention_heat(photo, read_map(attention))
+        found["attention"] = attention_heat(photo, read_map(attention, size=record.size))
     if (paths.refine / record.name).is_file():
         keep_mask = read_keep_mask(paths.refine / record.name, record.size)
         found["mask"] = mask_overlay(photo, keep_mask)
@@ -49,11 +49,11 @@ def photo_pictures(
         for folder in folders:
             path = paths.views / folder / record.name
             if path.is_file():
-                found[kind] = read_image(path, "render")
+                found[kind] = read_image(path, "render", record.size)
                 break
     depth = paths.views / "depth" / f"{record.stem}.exr"
     if depth.is_file():
-        found["depth"] = depth_colours(read_depth(depth))
+        found["depth"] = depth_colours(read_depth(depth, size=record.size))
     return {
         kind: data_uri(upright(rgb, record.turned), width, quality) for kind, rgb in found.items()
     }

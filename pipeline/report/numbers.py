@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.io.accounts import judged, unlike
+from pipeline.io.accounts import look_up as value
+
 # Heading of the group, label, dotted name, format, whether more is better (None: neither).
 ROWS: tuple[tuple[str, str, str, str, bool | None], ...] = (
     ("Held-out views", "PSNR, dB", "test.psnr", ".2f", True),
@@ -24,9 +27,9 @@ ROWS: tuple[tuple[str, str, str, str, bool | None], ...] = (
     ("Cleaned photos", "PSNR, dB", "composite.psnr", ".2f", True),
     ("Cleaned photos", "SSIM", "composite.ssim", ".4f", True),
     ("Cleaned photos", "PSNR under the drops, dB", "composite.covered_psnr", ".2f", True),
-    ("Photos as taken", "PSNR, dB", "input.psnr", ".2f", True),
-    ("Photos as taken", "SSIM", "input.ssim", ".4f", True),
-    ("Photos as taken", "PSNR under the drops, dB", "input.covered_psnr", ".2f", True),
+    ("Photos as taken", "PSNR, dB", "input.psnr", ".2f", None),
+    ("Photos as taken", "SSIM", "input.ssim", ".4f", None),
+    ("Photos as taken", "PSNR under the drops, dB", "input.covered_psnr", ".2f", None),
     ("Masks", "IoU with the true drops", "masks.iou", ".3f", True),
     ("Masks", "Precision", "masks.precision", ".3f", True),
     ("Masks", "Recall", "masks.recall", ".3f", True),
@@ -50,22 +53,22 @@ class Line:
     reason: str
 
 
-def value(metrics: Mapping[str, Any], name: str) -> float | None:
-    """The number at a dotted name, or None."""
-    group, leaf = name.split(".")
-    return metrics.get(group, {}).get(leaf)
-
-
 def table(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> list[Line]:
-    """The lines of the table, where there is a number; `other` are those of the fit to compare with."""
+    """The lines of the table, where there is a number; `other` are those of the fit to compare with.
+
+    Numbers that were measured on other photos, views or pixels have no difference.
+    """
     lines = []
+    apart = {name for those in unlike([metrics, other or {}]) for name in those.names}
     for group, label, name, form, rising in ROWS:
         own = value(metrics, name)
         theirs = value(other, name) if other else None
         if own is None and theirs is None:
             continue
         gain, ahead = "", None
-        if own is not None and theirs is not None and rising is not None and own != theirs:
+        if rising is None or name in apart:
+            pass
+        elif own is not None and theirs is not None and own != theirs:
             gain = f"{own - theirs:+{form}}"
             ahead = (own > theirs) == rising
         reason = metrics.get(name.split(".")[0], {}).get(f"{name.split('.')[1]}_reason", "")
@@ -85,6 +88,21 @@ def missing(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         (reason, "; ".join(f"{group}: {', '.join(labels)}" for group, labels in groups.items()))
         for reason, groups in by_reason.items()
     ]
+
+
+def incomparable(metrics: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Which differences the table leaves out, and why: (reason, labels under their groups)."""
+    found = []
+    for names, why, what in unlike([metrics, other]):
+        groups: dict[str, list[str]] = {}
+        for group, label, name, _, _ in ROWS:
+            if name in names and None not in (value(metrics, name), value(other, name)):
+                groups.setdefault(group, []).append(label.removesuffix(", dB"))
+        labels = "; ".join(f"{group}: {', '.join(those)}" for group, those in groups.items())
+        if labels:
+            reason = f"the two fits' {why} differ, and each is judged on {what} of its own"
+            found.append((reason, f"The difference in {labels}"))
+    return found
 
 
 def unmet(scene: str, variant: str) -> list[tuple[str, str]]:
@@ -114,12 +132,15 @@ def tiles(
     found: list[tuple[str, str, str]] = []
     test, photo = value(metrics, "test.psnr"), value(metrics, "input.psnr")
     theirs = value(other, "test.psnr") if other else None
+    same = _judged_alike(metrics, other)
     if test is not None:
-        found.append((f"{test:.1f}", "dB", "held-out views against clean references"))
-        if theirs is not None:
+        views = f"held-out views{judged(metrics)}"
+        found.append((f"{test:.1f}", "dB", f"{views} against clean references"))
+        if theirs is not None and same:
             found.append((f"{test - theirs:+.1f}", "dB", f"over {called(variant)}"))
     elif (kept := value(metrics, "selfcheck.kept_psnr")) is not None:
-        found.append((f"{kept:.1f}", "dB", "held-out views against the photos, beside the drops"))
+        views = f"held-out views{judged(metrics)}"
+        found.append((f"{kept:.1f}", "dB", f"{views} against the photos, beside the drops"))
     mixed = value(metrics, "composite.psnr")
     if mixed is not None and photo is not None:
         found.append((f"{mixed:.1f}", "dB", f"cleaned photos; as taken {photo:.1f} dB"))
@@ -155,12 +176,17 @@ def headline(
         text = "Without clean references the views cannot be judged under the drops"
         text += f"; beside them they match the photos to {kept:.1f} dB" if kept is not None else ""
         return f"{text}. {poses}"
-    text = f"Views held out of the fit reach {test:.1f} dB (SSIM {ssim:.3f}) against the dry scene"
+    text = f"Views held out of the fit{judged(metrics)} reach {test:.1f} dB (SSIM {ssim:.3f})"
+    text += " against the dry scene"
     theirs = value(other, "test.psnr") if other else None
-    if theirs is not None:
+    if theirs is not None and _judged_alike(metrics, other):
         word = "better" if test >= theirs else "worse"
         text += f", {abs(test - theirs):.1f} dB {word} than {called(variant)}"
     return f"{text}. {poses}"
+
+
+def _judged_alike(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> bool:
+    return all("test.psnr" not in those.names for those in unlike([metrics, other or {}]))
 
 
 def _cell(number: float | None, form: str) -> str:

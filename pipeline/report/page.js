@@ -25,10 +25,11 @@ for (const link of document.querySelectorAll("[data-film]")) {
 const hero = document.querySelector("[data-hero]");
 if (hero) {
   const source = document.getElementById(hero.dataset.hero);
-  const address = (kind) => source.querySelector(`[data-kind=${kind}] img`).src;
+  const picture = (kind) => source.querySelector(`[data-kind=${kind}] img`);
   const [before, after] = hero.querySelectorAll("img");
-  before.src = address("photo");
-  after.src = address("composite");
+  before.src = picture("photo").src;
+  after.src = picture("composite").src;
+  after.alt = picture("composite").alt;
 }
 for (const slider of document.querySelectorAll(".slider")) {
   const range = slider.querySelector("input");

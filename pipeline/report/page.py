@@ -57,6 +57,7 @@ class Page:
     video_missing: str
     missing: list[tuple[str, str]]
     conventions: Mapping[str, Any]
+    placing_known: bool = True  # whether poses.json was there
 
     @property
     def hero(self) -> Photo | None:

@@ -43,7 +43,6 @@ def charts(
     poses = {name: view.cam_from_world for name, view in posed.items()}
     test = {record.name for record in records if record.split == "test"}
     return {
-        "loss": curves(course("loss"), title="Loss", unit="", log=True, size=WIDE),
         "psnr": curves(course("psnr"), title="Training PSNR", unit="dB", size=WIDE),
         "views": bars(held_out, title="Held-out PSNR", unit="dB", size=WIDE),
         "cleaned": bars(cleaned, title="PSNR of photos", unit="dB", size=WIDE),

@@ -48,7 +48,10 @@ def test_a_scene_with_truth(tmp_path):
     # The made mask is coverage > 0.3 and the truth coverage > 0.05: nothing is dropped in vain.
     assert metrics["masks"]["precision"] == 1.0
     assert 0.5 < metrics["masks"]["recall"] < 1.0
-    assert f"{metrics['test']['psnr']:.2f} dB" in closing
+    assert metrics["judged"] == {
+        "held_out": ["view_00.png", "view_08.png"], "views": ["view_00.png"]
+    }  # fmt: skip
+    assert f"held-out views (1 of 2) {metrics['test']['psnr']:.2f} dB" in closing
     lines = paths.metrics_csv.read_text().splitlines()
     assert len(lines) == 10 and lines[1].startswith("view_00.png,test,")
 

@@ -74,3 +74,17 @@ def test_the_command(tmp_path, capsys):
     assert main([str(path), str(other)]) == 0
     told = capsys.readouterr().out
     assert str(path) in told and str(other) in told  # not one of the two as "demo"
+
+
+def test_views_that_were_lost_do_not_make_a_fit_better() -> None:
+    names = ["a.png", "b.png"]
+    own = {"test": {"psnr": 34.0}, "judged": {"held_out": names, "views": names[:1]}}
+    other = {"test": {"psnr": 22.0}, "judged": {"held_out": names, "views": names}}
+    assert (
+        "The fits' held-out views differ: each is judged on views of its own in test PSNR."
+        in table({"a": own, "b": other})
+    )
+    assert gains({"a": own, "b": other}) == ""
+    assert gains({"a": own, "b": {**other, "judged": own["judged"]}}).startswith(
+        "a over b: +12.00 dB"
+    )

@@ -21,12 +21,37 @@ def test_a_curve_goes_from_its_first_to_its_last_point():
 
 
 def test_points_that_cannot_be_drawn_are_left_out():
-    curve = [(0, 1.0), (1, math.nan), (2, math.inf), (3, 0.0), (4, 0.1)]
-    drawing = curves({"a": curve}, title="x", unit="", log=True, size=SIZE)
+    curve = [(0, 1.0), (1, math.nan), (2, math.inf), (4, 0.1)]
+    drawing = curves({"a": curve}, title="x", unit="", size=SIZE)
     assert len(re.search(r'points="([^"]+)"', drawing).group(1).split()) == 2
-    assert ">0.1<" not in drawing or "nan" not in drawing
     assert "nan" not in drawing and "inf" not in drawing
     assert curves({"a": [(0, math.nan)]}, title="x", unit="", size=SIZE) == ""
+
+
+def test_an_axis_has_numbers_within_it_whatever_its_range() -> None:
+    for low, high in ((20.0, 20.3), (0.0055, 0.0095), (3.0, 4000.0), (5.0, 5.0)):
+        drawing = curves({"a": [(0, low), (1, high)]}, title="x", unit="", size=SIZE)
+        ticks = [float(t) for t in re.findall(r'text-anchor="end"[^>]*>([\d.]+)<', drawing)]
+        pad = 0.06 * (high - low) or 0.5
+        assert len(ticks) >= 2 and all(low - pad <= tick <= high + pad for tick in ticks)
+
+
+def test_ahead_is_marked_where_the_cameras_look_one_way() -> None:
+    one_way, around = {}, {}
+    for n in range(8):
+        one_way[f"{n}"], around[f"{n}"] = np.eye(4), np.eye(4)
+        one_way[f"{n}"][0, 3] = n
+        turn = 2 * np.pi * n / 8
+        around[f"{n}"][[0, 0, 2, 2], [0, 2, 0, 2]] = (
+            np.cos(turn),
+            -np.sin(turn),
+            np.sin(turn),
+            np.cos(turn),
+        )
+        around[f"{n}"][2, 3] = 3.0
+    assert "ahead" in camera_map(one_way, set(), size=SIZE, side=True)
+    assert "ahead" not in camera_map(one_way, set(), size=SIZE)
+    assert "ahead" not in camera_map(around, set(), size=SIZE, side=True)
 
 
 def test_long_curves_are_thinned_and_keep_their_end():

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pipeline.report.numbers import headline, missing, table, tiles
+from pipeline.report.numbers import headline, incomparable, missing, table, tiles
 
 OWN = {
     "test": {"psnr": 28.5, "ssim": 0.91, "lpips": None, "lpips_reason": "no weights"},
@@ -43,6 +43,32 @@ def test_headline_and_tiles_tell_gain_and_loss_alike():
     assert "6.5 dB worse" in headline({**OTHER, "poses": OWN["poses"]}, OWN)
     assert ("+6.5", "dB", "over the same field fitted without masks") in tiles(OWN, OTHER)
     assert "over" not in str(tiles(OWN, None)) and "23/24" in str(tiles(OWN, None))
+
+
+def test_what_was_measured_on_other_views_pixels_or_photos_has_no_difference():
+    names = ["a.png", "b.png", "c.png"]
+    own = {**OWN, "judged": {"held_out": names, "views": names[:2]}}
+    other = {**OTHER, "input": {"psnr": 19.0}, "composite": {"psnr": 25.0}}
+    other |= {"judged": {"held_out": names, "views": names}}
+    lines = {(line.group, line.label): line for line in table(own, other)}
+    for where in (("Held-out views", "PSNR, dB"), ("Cleaned photos", "PSNR, dB")):
+        assert (lines[where].gain, lines[where].ahead) == ("", None)
+    assert [reason for reason, _ in incomparable(own, other)] == [
+        "the two fits' held-out views differ, and each is judged on views of its own",
+        "the two fits' photos differ, and each is judged on photos of its own",
+    ]
+    assert "better" not in headline(own, other) and "(2 of 3) reach 28.5 dB" in headline(own, other)
+    assert "over" not in str(tiles(own, other)) and "held-out views (2 of 3)" in str(
+        tiles(own, other)
+    )
+    assert incomparable(OWN, OTHER) == []
+
+
+def test_nobody_is_ahead_in_photos_that_nobody_made():
+    lines = table(OWN, {**OTHER, "input": {"psnr": 18.0}})
+    assert [(line.gain, line.ahead) for line in lines if line.group == "Photos as taken"] == [
+        ("", None)
+    ]
 
 
 def test_what_no_photo_shows_is_told_as_guessed():

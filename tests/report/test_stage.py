@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
+from pipeline.io.images import write_image
+from pipeline.io.maps import write_map
 from pipeline.stage import Job
 from stages import evaluate, report
 from tests.evaluation.fabricated import fabricate
@@ -101,7 +103,7 @@ def test_the_page_shows_numbers_of_both_fits_and_the_gap(root, html):
     for text in (f"{own:.2f}", f"{theirs:.2f}", f"{own - theirs:+.2f}", "8/9"):
         assert f">{text}<" in html
     assert "names no AlexNet weights" in html
-    assert html.count("<svg") == 7
+    assert html.count("<svg") == 6
     assert "data:video/mp4" in html
 
 
@@ -129,7 +131,25 @@ def test_a_page_without_truth_variant_video_or_fit(tmp_path):
     assert "cannot be judged under the drops" in html
     assert "does not exist" in html and "no video was made" in html
     assert ">unmasked<" not in html and "<video" not in html
-    assert "None: every photo was placed." in html
+    assert "every photo was placed" not in html and "poses.json, which tells, is not there" in html
+
+
+@pytest.mark.parametrize("what", ["images", "attention", "views/composite", "views/depth"])
+def test_pictures_of_another_size_are_told(tmp_path, what):
+    """Left from a run with another size: stretched over the photo they would lie."""
+    paths = fabricate(tmp_path, count=3, lost=0)
+    for path in (tmp_path / "artifacts/made" / what).iterdir():
+        if path.suffix == ".exr":
+            write_map(path, np.zeros((7, 9), np.float32))
+        elif path.suffix == ".png":
+            write_image(path, np.zeros((7, 9, 3), np.float32))
+    with pytest.raises(UserError, match=r"is 9x7, (not|its image)"):
+        make(tmp_path, variants=(None,))
+    assert not (paths.report / "index.html").exists()
+
+
+def test_a_lost_photo_is_marked_as_lost_though_it_was_to_be_held_out(html):
+    assert re.search(r'<a href="#photo-8" class="lost"', html)
 
 
 def test_a_comparison_without_numbers_is_told_on_the_page_and_on_the_terminal(tmp_path, caplog):
