@@ -37,9 +37,7 @@ class Params(Section):
     weights: Annotated[
         str, Field(description="official weights; empty: those that train_remover makes")
     ]
-    published_edges: Annotated[
-        bool, Field(description="quan: two empty edge channels, as released")
-    ]
+    published_edges: Annotated[bool, Field(description="quan: edges as released, or as meant")]
     keep_clear: Annotated[bool, Field(description="wen: what its map calls clear stays the photo")]
     precision: Literal["auto", "float32", "bfloat16"]
 

@@ -45,7 +45,7 @@ def clean_attgan(
 def clean_quan(
     network: QuanNet, image: np.ndarray, *, published: bool = True, half: bool = False
 ) -> np.ndarray:
-    """As :func:`clean_attgan`; `published` keeps the released code's edges (`oriented_edges`)."""
+    """As :func:`clean_attgan`; `published`: the released code's edges (`oriented_edges`)."""
     device = next(network.parameters()).device
     rgb = _planes(image, device)
     with torch.inference_mode(), products(device, half):
