@@ -28,6 +28,7 @@ from pipeline.removal.clean import (
 )
 from pipeline.removal.precision import in_half, keep_exact, products
 from pipeline.removal.quan import QuanNet
+from pipeline.removal.record import edges_of
 from pipeline.removal.wen import WenNet
 from stages import restore
 
@@ -168,10 +169,12 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run_stage(root: Path, weights: str, method: str = "attgan", precision: str = "auto") -> int:
+def run_stage(
+    root: Path, weights: str, method: str = "attgan", precision: str = "auto", edges: str = "true"
+) -> int:
     (root / "p").write_text(
         f"scenes: {{glass: {{}}}}\n"
-        f'restore: {{method: {method}, weights: "{weights}", published_edges: true, '
+        f'restore: {{method: {method}, weights: "{weights}", published_edges: {edges}, '
         f"keep_clear: true, precision: {precision}}}\n"
     )
     with pytest.raises(SystemExit) as stop:
@@ -198,6 +201,26 @@ def test_every_photo_is_restored(scene: Path) -> None:
     save_tensors(scene / "weights/removers/attgan.safetensors", whole)
     assert run_stage(scene, "") == 0  # where no weights are named: our own
     assert np.array_equal(read_image(out / "a.png"), first)
+
+
+def test_weights_that_say_their_edges_are_not_used_with_others(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files that say nothing pass: the published ones, and those of before."""
+    state = QuanNet().state_dict()
+    save_tensors(scene / "silent.safetensors", state, {"model": "quan"})
+    save_tensors(scene / "meant.safetensors", state, {"model": "quan", "published_edges": "false"})
+    torch.save(state, scene / "silent.pt")
+    for weights in ("silent.safetensors", "silent.pt", "meant.safetensors"):
+        assert run_stage(scene, weights, "quan", edges="false") == 0
+    assert run_stage(scene, "silent.safetensors", "quan", edges="true") == 0
+    capsys.readouterr()
+    assert run_stage(scene, "meant.safetensors", "quan", edges="true") == 2
+    told = capsys.readouterr().err
+    assert "meant.safetensors was trained with published_edges: false, and" in told
+    assert "Set restore.published_edges to false" in told
+    assert edges_of(scene / "meant.safetensors") is False
+    assert edges_of(scene / "silent.safetensors") is edges_of(scene / "silent.pt") is None
 
 
 def test_wen_restores_runs_and_names_the_photo_that_fails(

@@ -15,13 +15,14 @@ from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.attention.training import attention_loss
 from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
-from pipeline.io.tensors import save_tensors
+from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.removal import clips, training
 from pipeline.removal.autoencoder import Scales, multi_scale_loss
 from pipeline.removal.critics import AttentiveCritic, PatchCritic, Verdict
 from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, wen_loss
 from pipeline.removal.recipes import Added, AnyRecipe, recipe_of, weights_of
 from pipeline.removal.samples import Pairs, draw_batch, draw_resident, drop_map
+from pipeline.removal.store import save_remover
 from pipeline.removal.training import Phase, Plan, Trainer, fit
 from pipeline.removal.wen import Frames, mend
 from tests.answers import answers
@@ -144,6 +145,26 @@ def test_what_is_added_to_the_published_losses_is_added() -> None:
     clear = torch.tensor([[1.0, 0.0], [0.25, 0.5]]).view(1, 1, 1, 2, 2)
     mended = mend(frames, full, clear)
     assert mended[0, 0, 0].tolist() == [[0, 1], [0.75, 0.5]]
+
+
+def test_weights_say_how_they_were_trained(tmp_path: Path) -> None:
+    """Which edges quan saw, and whether wen's photo was mended; attgan has neither."""
+    how = {"attention": None, "map_loss": attention_loss, "train_attention": False, "steps": 1}
+    told = []
+    for method, edges, mended in (
+        ("quan", True, 0), ("quan", False, 0), ("wen", True, 0), ("wen", True, 50),
+    ):  # fmt: skip
+        made = recipe_of(method, 0, published_edges=edges, added=Added(0, 0, mended), **how)  # type: ignore[arg-type]
+        save_remover(tmp_path / "w.safetensors", made, method)
+        told.append(load_tensors(tmp_path / "w.safetensors")[1])
+    assert told == [
+        {"model": "quan", "published_edges": "true"},
+        {"model": "quan", "published_edges": "false"},
+        {"model": "wen", "mended": "false"},
+        {"model": "wen", "mended": "true"},
+    ]
+    save_remover(tmp_path / "w.safetensors", recipe("attgan"), "attgan")
+    assert load_tensors(tmp_path / "w.safetensors")[1] == {"model": "attgan"}
 
 
 def test_the_discriminators_maps_are_to_be_the_generators_and_nothing() -> None:
