@@ -18,7 +18,7 @@ from pipeline.io.scene import read_images_json, write_images_json
 from pipeline.io.weights import fill, read_state
 from pipeline.parallel import cores, cut, map_named
 from pipeline.removal.autoencoder import ContextualAutoencoder
-from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen_run, windows_of
+from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen_run, too_large, windows_of
 from pipeline.removal.precision import in_half, keep_exact
 from pipeline.removal.quan import QuanNet, from_tensorflow
 from pipeline.removal.record import check_edges
@@ -93,8 +93,8 @@ def clean_run(
     for photo in photos:
         try:
             write_image(out / photo.name, next(done))
-        except RuntimeError as error:  # the run has a name of its own
-            raise RuntimeError(f"{photo.name}: {error}") from error
+        except (MemoryError, RuntimeError) as error:  # the run has a name of its own
+            raise too_large(error, photo.name) or RuntimeError(f"{photo.name}: {error}") from error
 
 
 @lru_cache(maxsize=1)

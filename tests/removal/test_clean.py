@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from pipeline.removal.clean import (
     clean_quan,
     clean_wen,
     clean_wen_run,
+    too_large,
     window_around,
     windows_of,
 )
@@ -242,6 +244,30 @@ def test_wen_restores_runs_and_names_the_photo_that_fails(
     (scene / "artifacts/glass/images/b.png").write_text("no photo")
     assert run_stage(scene, "wen.safetensors", "wen") == 2
     assert "b.png is not a readable image" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "fault", [lambda: torch.empty(2**60), lambda: np.empty(2**50), torch.OutOfMemoryError]
+)
+def test_photos_too_large_for_the_memory_are_told_in_a_sentence(
+    scene: Path,
+    fault: Callable[[], Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def cleaned(*_: Any, **__: Any) -> np.ndarray:
+        made = fault()
+        raise made if isinstance(made, Exception) else AssertionError
+
+    save_tensors(scene / "quan.safetensors", QuanNet().state_dict())
+    monkeypatch.setattr(restore, "clean_quan", cleaned)
+    assert run_stage(scene, "quan.safetensors", "quan") == 2
+    told = capsys.readouterr().err
+    assert ".png is too large to be restored" in told and "ingest.max_size" in told
+
+
+def test_other_faults_stay_faults_of_the_program() -> None:
+    assert too_large(RuntimeError("shapes do not match"), "a.png") is None
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import nn
 
+from pipeline.removal import wen
 from pipeline.removal.autoencoder import ContextualAutoencoder, Scales, multi_scale_loss
 from pipeline.removal.quan import QuanNet, _Same, from_tensorflow, tensorflow_name
 from pipeline.removal.shape_attention import KERNELS, oriented_edges, shape_attention, torque
@@ -217,6 +218,27 @@ def test_a_single_patch_attends_to_itself_alone() -> None:
     expected = mixed.view(2, 2, 128, 4, 4).permute(2, 0, 3, 1, 4).reshape(128, 8, 8)
     assert torch.allclose(heads[0][0, :128], value[0, :128], atol=1e-5)
     assert torch.allclose(heads[0][0, 128:], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("most", [1, 100, 1000])
+def test_patches_that_ask_in_blocks_find_the_same(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two groups of two frames, of 4 and 16 patches each; the last block is a shorter one."""
+    torch.manual_seed(3)
+    layer = _PatchAttention((8, 4)).eval()
+    x = torch.randn(4, 256, 16, 16)
+    held = []
+    layer.softmax.register_forward_hook(lambda *call: held.append(call[2].numel()))
+    with torch.inference_mode():
+        whole, alone = layer(x, 2), layer(x, 2, x[::2])
+        assert held == [2 * 8 * 8, 2 * 32 * 32, 2 * 4 * 8, 2 * 16 * 32]
+        held.clear()
+        monkeypatch.setattr(wen, "WEIGHED", most)
+        assert torch.allclose(layer(x, 2), whole, atol=1e-6)
+        assert torch.allclose(layer(x, 2, x[::2]), alone, atol=1e-6)
+    assert max(held) <= max(most, 2 * 32)  # a single query's at least
+    assert len(held) > 4
 
 
 def test_frames_attend_to_each_other_only_in_the_temporal_blocks() -> None:
