@@ -34,8 +34,8 @@ class Features(NamedTuple):
 def mend(frames: Tensor, full: Tensor, clear: Tensor) -> Tensor:
     """The frames (...,3,H,W) where the map says that they are clear, and what was found elsewhere.
 
-    The picture that the released training compares once more for single photos, there with the true
-    map; the released program gives out `full` as it is.
+    The picture that the released training compares once more for single photos; the released program
+    gives out `full` as it is.
     """
     return frames * clear + full * (1 - clear)
 
