@@ -110,8 +110,8 @@ def _training(job: Job, params: Params) -> list[Pool]:
 
 def _validation(job: Job, params: Params) -> dict[str, Pool]:
     """Pictures of other seeds, photos and places than those that are trained on."""
-    folders = map(job.resolve, params.validation_rendered)
-    sets = {path.name: pools.read_rendered(path) for path in folders}
+    folders = [job.resolve(path) for path in params.validation_rendered]
+    sets = pools.read_by_name(folders, "painted")
     sets["painted"] = _painted(job, params.validation_photos, params.seed + 1, params.validation)
     return {name: Pool(*pools.aimed(pictures, params.target)) for name, pictures in sets.items()}
 

@@ -106,6 +106,21 @@ def read_rendered(folder: Path) -> Pictures:
     return pictures
 
 
+def read_by_name(folders: Sequence[Path], *others: str) -> dict[str, Pictures]:
+    """`read_rendered` of each folder, under its last name, which a validation curve tells it by.
+
+    UserError where two folders have one name, or one has that of another set.
+    """
+    names = [*(folder.name for folder in folders), *others]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise UserError(
+            f"Two validation sets are called {twice[0]}; the curve would show one of them.",
+            "Rename a folder of train_detector.validation_rendered; `painted` is the painted set.",
+        )
+    return {folder.name: read_rendered(folder) for folder in folders}
+
+
 def read_photo_pairs(folder: Path) -> Pictures:
     """Pairs of photos in the published layout: data/N_rain.png and gt/N_clean.png.
 
