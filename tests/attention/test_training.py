@@ -23,6 +23,7 @@ from pipeline.attention.training import (
     count,
     fit,
     overlap_loss,
+    phases_of,
     score,
     scores,
 )
@@ -220,6 +221,23 @@ def test_scores_at_each_threshold_by_hand() -> None:
     assert (low.precision, low.recall) == (pytest.approx(2 / 3), 1)
     assert (low.f1, low.iou) == (pytest.approx(0.8), pytest.approx(2 / 3))
     assert (high.precision, high.recall, high.iou) == (1, 0.5, 0.5)
+
+
+def test_a_single_pixel_is_nothing_to_normalise_over() -> None:
+    """At a sixteenth one crop of 16 pixels is one; two crops, or 17 pixels, are more."""
+
+    def told(batch: int, crop: int) -> list[dict[str, float]]:
+        return [{"steps": 1, "iterations": 1, "batch": batch, "crop": crop, "rate": 0.01}]
+
+    with pytest.raises(UserError, match="batches of one crop of 16 pixels"):
+        phases_of(DropUNet(), told(1, 16))
+    for batch, crop in ((2, 16), (1, 17)):
+        network = DropUNet()
+        network.initialise(0)
+        phases = phases_of(network, told(batch, crop))
+        trainer = Trainer(network, [_pool(2)], phases, seed=0, clean_share=0.0)
+        assert np.isfinite(trainer.advance())
+    assert phases_of(AttentiveRecurrentNet(), told(1, 16)) == [Phase(1, 1, 1, 16, 0.01)]
 
 
 def test_folders_of_pairs(tmp_path: Path) -> None:
