@@ -4,7 +4,7 @@
 OUT/{rainy,coverage,clean}/NNN.png. Even seeds are streets, odd ones rooms. Every view has a drop
 pattern, a pane and an aperture of its own, unless --shared fixes one pattern to the lens per seed. With
 --arm, every second pane stays in the scene at arm's length, seen aslant, and half of all panes hold
-flat drops.
+flat drops. What was asked for stands in OUT/recipe.json: the same command goes on, another is refused.
 Seeds below 100 are left to the scenes that detectors are judged on.
 """
 
@@ -20,9 +20,11 @@ from tqdm import tqdm
 from pipeline.drops import mitsuba_scene, places, synthesis
 from pipeline.drops.shape import Drop
 from pipeline.errors import UserError
+from pipeline.io.atomic import read_json, write_json
 from pipeline.io.images import write_image
 
 WIDTH, HEIGHT = 400, 300
+FOLDERS = ("rainy", "coverage", "clean")
 
 
 def random_pane(
@@ -72,9 +74,42 @@ def flattened(rng: np.random.Generator, drops: list[Drop]) -> list[Drop]:
     return [replace(drop, contact_angle=drop.contact_angle * factor) for drop in drops]
 
 
+def settle(out: Path, recipe: dict[str, object], count: int) -> None:
+    """Writes down of which recipe the pictures in `out` are, `count` of them; UserError for another's.
+
+    They are named by number, so that pictures of other seeds would pass for these. A folder of before,
+    without a recipe, passes where it holds as many.
+    """
+    kept = out / "recipe.json"
+    hint = "Name another folder, or remove this one."
+    if kept.is_file():
+        before = read_json(kept)
+        other = [f"{key} {before.get(key)}" for key in recipe if before.get(key) != recipe[key]]
+        if other:
+            raise UserError(f"{out} holds pictures of another recipe: {', '.join(other)}.", hint)
+        return
+    missing = [not (out / "rainy" / f"{k:03d}.png").exists() for k in range(count)]
+    if not any(missing):
+        return
+    if not all(missing):
+        raise UserError(f"{out} holds some of the pictures and does not say of which recipe.", hint)
+    write_json(kept, recipe)
+
+
 def make(out: Path, seeds: range, views: int, spp: int, shared: bool, arm: bool) -> None:
-    """Renders the pairs that `out` does not hold yet."""
-    for folder in ("rainy", "coverage", "clean"):
+    """Renders the pairs that `out` does not hold yet; UserError where it holds others, see `settle`."""
+    settle(
+        out,
+        {
+            "seeds": [seeds.start, seeds.stop],
+            "views": views,
+            "spp": spp,
+            "shared": shared,
+            "arm": arm,
+        },
+        len(seeds) * views,
+    )
+    for folder in FOLDERS:
         (out / folder).mkdir(parents=True, exist_ok=True)
     for index, seed in enumerate(tqdm(seeds, desc="places")):
         names = [f"{index * views + k:03d}.png" for k in range(views)]
@@ -114,7 +149,10 @@ def main() -> None:
         "--arm", action="store_true", help="panes in the scene, and flat drops, too"
     )
     flags = parser.parse_args()
-    make(flags.out, range(*flags.seeds), flags.views, flags.spp, flags.shared, flags.arm)
+    try:
+        make(flags.out, range(*flags.seeds), flags.views, flags.spp, flags.shared, flags.arm)
+    except UserError as error:
+        parser.exit(2, f"{error}\n")
 
 
 if __name__ == "__main__":

@@ -18,9 +18,10 @@ from pipeline.io.scene import read_images_json, write_images_json
 from pipeline.io.weights import fill, read_state
 from pipeline.parallel import cores, cut, map_named
 from pipeline.removal.autoencoder import ContextualAutoencoder
-from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen_run, windows_of
+from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen_run, too_large, windows_of
 from pipeline.removal.precision import in_half, keep_exact
 from pipeline.removal.quan import QuanNet, from_tensorflow
+from pipeline.removal.record import check_edges
 from pipeline.removal.wen import WenNet
 from pipeline.stage import Job, Section, run
 
@@ -34,12 +35,8 @@ class Params(Section):
     """Section `restore`."""
 
     method: Literal["attgan", "quan", "wen"]
-    weights: Annotated[
-        str, Field(description="official weights; empty: those that train_remover makes")
-    ]
-    published_edges: Annotated[
-        bool, Field(description="quan: two empty edge channels, as released")
-    ]
+    weights: Annotated[str, Field(description="official; empty: those that train_remover makes")]
+    published_edges: Annotated[bool, Field(description="quan: edges as released, or as meant")]
     keep_clear: Annotated[bool, Field(description="wen: what its map calls clear stays the photo")]
     precision: Literal["auto", "float32", "bfloat16"]
 
@@ -56,6 +53,8 @@ def main(job: Job, params: Params) -> str:
     digest = hashlib.sha256(weights.read_bytes()).hexdigest() if weights.is_file() else ""
     which = (params.method, weights, digest, job.device)
     networks_of(*which)  # what is wrong with them is told once
+    if params.method == "quan":
+        check_edges(weights, params.published_edges)
     records = read_images_json(job.paths.images)
     names = [record.name for record in records]
     half = in_half(params.precision, job.device)
@@ -94,8 +93,8 @@ def clean_run(
     for photo in photos:
         try:
             write_image(out / photo.name, next(done))
-        except RuntimeError as error:  # the run has a name of its own
-            raise RuntimeError(f"{photo.name}: {error}") from error
+        except (MemoryError, RuntimeError) as error:  # the run has a name of its own
+            raise too_large(error, photo.name) or RuntimeError(f"{photo.name}: {error}") from error
 
 
 @lru_cache(maxsize=1)

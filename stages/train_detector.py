@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from pipeline.attention import pools
 from pipeline.attention.samples import Pool
-from pipeline.attention.training import CURVE, Phase, Score, Trainer, curve_rows, fit, score
+from pipeline.attention.training import CURVE, Score, Trainer, curve_rows, fit, phases_of, score
 from pipeline.attention.weights import averaged, first_network, load_others, save_network
 from pipeline.drops.pairs import KINDS, Kind
 from pipeline.io.atomic import write_csv
@@ -61,8 +61,8 @@ def main(job: Job, params: Params) -> str:
     """Writes the weights, and beside them the validation curve as CSV."""
     start = job.resolve(params.start) if params.start else None
     network = first_network(start, params.model, params.seed, named_by="train_detector.start")
-    training, validation = _training(job, params), _validation(job, params)
-    phases = [Phase(**phase.model_dump()) for phase in params.phases]
+    phases = phases_of(network, [phase.model_dump() for phase in params.phases])
+    validation, training = _validation(job, params), _training(job, params)
     network.to(job.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     told = params.model_dump(include={"seed", "clean_share", "lures", "bfloat16", "on_device"})
     trainer = Trainer(network, training, phases, **told)
@@ -110,8 +110,7 @@ def _training(job: Job, params: Params) -> list[Pool]:
 
 def _validation(job: Job, params: Params) -> dict[str, Pool]:
     """Pictures of other seeds, photos and places than those that are trained on."""
-    folders = map(job.resolve, params.validation_rendered)
-    sets = {path.name: pools.read_rendered(path) for path in folders}
+    sets = pools.read_by_name([job.resolve(p) for p in params.validation_rendered], "painted")
     sets["painted"] = _painted(job, params.validation_photos, params.seed + 1, params.validation)
     return {name: Pool(*pools.aimed(pictures, params.target)) for name, pictures in sets.items()}
 

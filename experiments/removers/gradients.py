@@ -4,7 +4,7 @@
 
 CHUNK.npy: a hundred painted pictures, artifacts/.work/<scene>/train_remover/painted-*/0000.npy. Without
 weights: those that training starts from. The loss is the published one; silent: channels that are zero in
-all of the batch.
+all of the batch. Edges are those that the weights say, or the published ones.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pipeline.attention import pools
 from pipeline.io.weights import fill, read_state
 from pipeline.removal import starts
 from pipeline.removal.quan import QuanNet
+from pipeline.removal.record import edges_of
 from pipeline.removal.samples import Pairs, draw_batch
 
 LAYERS = ("enc1_1", "enc1_3.conv1_2", "enc2_1", "enc2_3.conv1_1", "enc3_1", "enc3_3.conv1_1", "dec3_2.conv1_2",
@@ -38,7 +39,8 @@ def main() -> None:
         fill(network, read_state(flags.weights, ""), str(flags.weights))
     pool = Pairs(*pools.read_chunk(flags.chunk))
     rainy, clean, _ = (part[:, 0] for part in draw_batch([pool], np.random.default_rng(3), 4, 64))
-    last = network.decoded(rainy)[-1]
+    published = not flags.weights or edges_of(flags.weights) is not False
+    last = network.decoded(rainy, published=published)[-1]
     F.l1_loss(network.dec1_0(last), clean).backward()
     print(f"silent channels before the last layer: {int((last.amax((0, 2, 3)) == 0).sum())} of 32")
     for name in LAYERS:

@@ -30,6 +30,7 @@ from pipeline.evaluation.image import psnr, ssim
 from pipeline.io.images import read_photo, write_image
 from pipeline.removal import clips
 from pipeline.removal.clean import clean_attgan, clean_quan, clean_wen, window_around
+from pipeline.removal.record import edges_of
 from stages.restore import networks_of
 
 SIXTH = 6
@@ -86,12 +87,13 @@ def pair_cases(folder: Path) -> Iterator[Case]:
 
 
 def restored(method: str, weights: Path, case: Case, keep_clear: bool) -> np.ndarray:
-    """The photo as the stage `restore` makes it."""
+    """The photo as the stage `restore` makes it; quan with the edges that its weights say, or the published."""
     networks = networks_of(method, weights, "", "cpu")
     if method == "wen":
         return clean_wen(networks[0], case.window, case.scored, keep_clear=keep_clear)  # type: ignore[arg-type]
     if method == "quan":
-        return clean_quan(networks[0], case.window[case.scored])  # type: ignore[arg-type]
+        published = edges_of(weights) is not False
+        return clean_quan(networks[0], case.window[case.scored], published=published)  # type: ignore[arg-type]
     attend = partial(_last_map, networks[0])
     return clean_attgan(networks[1], case.window[case.scored], attend)  # type: ignore[arg-type]
 

@@ -83,9 +83,18 @@ def _spans(length: int, tile: int, grid: int) -> Iterator[tuple[int, int]]:
 
 def _map(network: Detector, bgr: Tensor, steps: int) -> np.ndarray:
     device = next(network.parameters()).device
-    # Full float32 and fixed algorithms: the map is the same every time, on a GPU too.
-    exact = torch.backends.cudnn.flags(
-        enabled=True, benchmark=False, deterministic=True, allow_tf32=False
-    )
-    with torch.inference_mode(), exact:
+    exact_products(device)
+    with torch.inference_mode():
         return network.attention(bgr.contiguous().to(device), steps)[0, 0].cpu().numpy()
+
+
+def exact_products(device: torch.device) -> None:
+    """On a GPU, full float32 and fixed algorithms from here on: the map is the same every time.
+
+    For the whole process, and not taken back: several threads make maps at once, and the flags are
+    shared, so that what one put back another would compute with.
+    """
+    if device.type == "cuda":
+        torch.backends.cudnn.benchmark = False
+        torch.backends.cudnn.deterministic = True
+        torch.backends.cudnn.allow_tf32 = False

@@ -14,7 +14,7 @@ from pipeline.drops.backgrounds import sample_background
 from pipeline.drops.pairs import Kind, sample_shots
 from pipeline.errors import UserError
 from pipeline.io.atomic import write_npy
-from pipeline.io.images import PHOTO_SUFFIXES, as_bytes, read_photo
+from pipeline.io.images import PHOTO_SUFFIXES, as_bytes, read_photo, shrink
 
 CHUNK = 100
 SIZE = 256
@@ -94,28 +94,43 @@ def list_pictures(folder: Path) -> tuple[Path, ...]:
 def read_rendered(folder: Path) -> Pictures:
     """Pairs of a renderer: folders rainy, clean and coverage (8-bit grey) with the same names.
 
-    Raises UserError where a folder is empty, a partner is missing or the sizes differ.
+    Larger ones are shrunk to stills.LONGEST pixels on their longest side, as the photos are that drops
+    are painted on. Raises UserError where a folder is empty, a partner is missing or the sizes differ.
     """
     pictures: Pictures = ([], [], [])
     for name in _names(folder / "rainy"):
-        wet, dry, cover = (_partner(folder / kind / name) for kind in KINDS)
-        _same_size(folder / "rainy" / name, wet, dry, cover)
+        partners = [folder / kind / name for kind in KINDS]
+        wet, dry, cover = _of_one_view(*partners)
         for part, picture in zip(pictures, (wet, dry, cover[..., 0]), strict=True):
             part.append(picture)
     return pictures
 
 
+def read_by_name(folders: Sequence[Path], *others: str) -> dict[str, Pictures]:
+    """`read_rendered` of each folder, under its last name, which a validation curve tells it by.
+
+    UserError where two folders have one name, or one has that of another set.
+    """
+    names = [*(folder.name for folder in folders), *others]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise UserError(
+            f"Two validation sets are called {twice[0]}; the curve would show one of them.",
+            "Rename a folder of train_detector.validation_rendered; `painted` is the painted set.",
+        )
+    return {folder.name: read_rendered(folder) for folder in folders}
+
+
 def read_photo_pairs(folder: Path) -> Pictures:
     """Pairs of photos in the published layout: data/N_rain.png and gt/N_clean.png.
 
-    Their coverage is where they differ; see samples.coverage_of_pair. Raises UserError where the
-    folder is empty, a partner is missing or the sizes differ.
+    Their coverage is where they differ, once shrunk as in `read_rendered`; see samples.coverage_of_pair.
+    Raises UserError where the folder is empty, a partner is missing or the sizes differ.
     """
     pictures: Pictures = ([], [], [])
     for name in _names(folder / "data"):
-        wet = _partner(folder / "data" / name)
-        dry = _partner(folder / "gt" / name.replace("_rain", "_clean"))
-        _same_size(folder / "data" / name, wet, dry)
+        partner = folder / "gt" / name.replace("_rain", "_clean")
+        wet, dry = _of_one_view(folder / "data" / name, partner)
         for part, picture in zip(pictures, (wet, dry, coverage_of_pair(wet, dry)), strict=True):
             part.append(picture)
     return pictures
@@ -164,9 +179,14 @@ def _partner(path: Path) -> np.ndarray:
     return read_photo(path)[0]
 
 
-def _same_size(path: Path, *pictures: np.ndarray) -> None:
+def _of_one_view(*paths: Path) -> list[np.ndarray]:
+    """The pictures of a view, rainy first: of one size, and none larger than clean stills are."""
+    pictures = [_partner(path) for path in paths]
     if len({picture.shape for picture in pictures}) > 1:
-        raise UserError(f"{path} and its partners differ in size.", "Crop them to the same view.")
+        raise UserError(
+            f"{paths[0]} and its partners differ in size.", "Crop them to the same view."
+        )
+    return [shrink(picture, stills.LONGEST) for picture in pictures]
 
 
 def _names(folder: Path) -> list[str]:

@@ -200,6 +200,24 @@ class Trainer:
         self.phase, self.iteration, self.seen, self.done = state["where"]
 
 
+def phases_of(network: Detector, told: Sequence[Mapping[str, Any]]) -> list[Phase]:
+    """The phases as they are told; UserError for one that the network cannot learn from.
+
+    Of one crop of no more than 16 pixels the U-Net's normalisation sees, at its smallest scale, a single
+    number per channel.
+    """
+    phases = [Phase(**each) for each in told]
+    for phase in phases:
+        seen = phase.batch * math.ceil(phase.crop / network.grid) ** 2
+        if isinstance(network, DropUNet) and seen < 2:
+            raise UserError(
+                f"The unet cannot learn from batches of one crop of {phase.crop} pixels: "
+                "at its smallest scale that is one pixel.",
+                f"Raise batch to 2, or crop above {network.grid}, in that phase of train_detector.",
+            )
+    return phases
+
+
 def rate_at(phase: Phase, iteration: int) -> float:
     """Muon's learning rate: it rises over twenty iterations and falls along a half cosine."""
     warm = min(1.0, (iteration + 1) / 20)

@@ -20,6 +20,7 @@ DETECTORS: dict[str, type[AttentiveRecurrentNet] | type[DropUNet]] = {
     "attentive": AttentiveRecurrentNet,
     "unet": DropUNet,
 }
+WHOLE = "attgan"  # what a file of the attentive network and its autoencoder says that it is for
 
 
 def save_network(path: Path, network: Detector) -> None:
@@ -35,14 +36,14 @@ def load_network(
     """The network `model` with the weights of a file, in evaluation mode on the CPU.
 
     The file: safetensors, npz, or a PyTorch state dict, which is read without running code from it;
-    for the attentive network also that of the whole official generator (what belongs to its
-    autoencoder is passed over). Raises UserError for a missing, unreadable, unsafe or unfitting file,
-    with the parameter that it is `named_by`.
+    for the attentive network also that of the whole generator, the official one or one that
+    train_remover made (what belongs to its autoencoder is passed over). Raises UserError for a
+    missing, unreadable, unsafe or unfitting file, with the parameter that it is `named_by`.
     """
     state = read_state(path, f"Set {named_by} in params.yaml, or restore the file.")
     if path.suffix == ".safetensors":
         made_for = load_tensors(path)[1].get("model", model)
-        if made_for != model:
+        if made_for != model and (made_for, model) != (WHOLE, "attentive"):
             raise UserError(
                 f"{path} is for the detector {made_for!r}, not for {model!r}.",
                 f"Change {named_by} in params.yaml, or the model beside it.",

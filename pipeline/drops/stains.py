@@ -18,6 +18,7 @@ from pipeline.errors import UserError
 Rng = np.random.Generator
 Draw = Callable[[Rng, Image, float], None]  # one stain onto the opacity; pixels per millimetre
 VISIBLE = 0.1  # opacity from which a stain counts as covering
+MOST = 200_000  # stains of a kind
 
 
 def _spot(rng: Rng, canvas: Image) -> tuple[int, int]:
@@ -92,18 +93,25 @@ def sample_stains(
 ) -> Image:
     """Layer (H, W, 4) of one kind, premultiplied, that visibly covers about `coverage` of it.
 
-    Translucent: dust, smears, scratches; opaque: dirt, snow. Raises UserError for another kind.
+    Translucent: dust, smears, scratches; opaque: dirt, snow. Raises UserError for another kind, and
+    where MOST of them do not reach the share.
     """
     if kind not in _KINDS:
         raise UserError(f"no stain is called {kind!r}", hint=f"use one of {', '.join(NAMES)}")
     draw, colour, soft = _KINDS[kind]
     sharp = opacity = np.zeros(shape, np.float32)
-    for number in range(200_000):
+    for number in range(MOST):
         if number < 64 or number % 8 == 0:  # measured as it will be seen, with soft rims
             opacity = _soft(sharp, soft * pixels_per_mm)
             if (opacity > VISIBLE).mean() >= coverage:
                 break
         draw(rng, sharp, pixels_per_mm)
+    else:
+        reached = (_soft(sharp, soft * pixels_per_mm) > VISIBLE).mean()
+        raise UserError(
+            f"{MOST} stains of kind {kind} cover only {reached:.2%} of the pane, not {coverage:.2%}",
+            hint=f"lower the share of {kind} in synthesize.stains",
+        )
     return np.dstack([opacity[..., None] * np.asarray(colour, np.float32), opacity])
 
 

@@ -13,16 +13,16 @@ from torch import Tensor, nn
 from pipeline.errors import UserError
 from pipeline.io.tensors import load_tensors
 
-WRAPPERS = ("state_dict", "model", "params")
+WRAPPERS = ("state_dict", "model", "params", "network")
 
 
 def read_state(path: Path, hint: str = "") -> dict[str, Tensor]:
     """The named tensors of a weights file, on the CPU, without a leading `module.`.
 
     safetensors, NumPy's npz, or a PyTorch file holding a state dict, bare or under `state_dict`,
-    `model` or `params`. A PyTorch file is a pickle: it is read with torch's restricted unpickler,
-    which builds tensors and containers and runs nothing. UserError for a missing, unreadable or
-    unsafe file.
+    `model`, `params` or `network`. A PyTorch file is a pickle: it is read with torch's restricted
+    unpickler, which builds tensors and containers and runs nothing. UserError for a missing,
+    unreadable or unsafe file, and for tensors without names.
     """
     if not path.is_file():
         raise UserError(f"The weights {path} do not exist.", hint)
@@ -70,6 +70,12 @@ def _read_torch(path: Path, hint: str) -> Mapping[str, Any]:
         raise UserError(
             f"{path} holds a {type(state).__name__}, not a state dict.",
             f"{hint} Save network.state_dict(), not the network.".strip(),
+        )
+    strange = [key for key in state if not isinstance(key, str)]
+    if strange:
+        raise UserError(
+            f"{path} holds tensors without names (the first key is {strange[0]!r:.40}).",
+            f"{hint} Save network.state_dict().".strip(),
         )
     return state
 

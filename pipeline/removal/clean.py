@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from pipeline.errors import UserError
 from pipeline.removal import autoencoder, quan, wen
 from pipeline.removal.autoencoder import ContextualAutoencoder
 from pipeline.removal.precision import products
@@ -45,7 +46,7 @@ def clean_attgan(
 def clean_quan(
     network: QuanNet, image: np.ndarray, *, published: bool = True, half: bool = False
 ) -> np.ndarray:
-    """As :func:`clean_attgan`; `published` keeps the released code's edges (`oriented_edges`)."""
+    """As :func:`clean_attgan`; `published`: the released code's edges (`oriented_edges`)."""
     device = next(network.parameters()).device
     rgb = _planes(image, device)
     with torch.inference_mode(), products(device, half):
@@ -145,6 +146,19 @@ def windows_of(frames: Sequence[Key], run: range) -> list[tuple[list[Key], int]]
     """`window_around` each frame of a run of all `frames`, with the frames themselves."""
     around = (window_around(index, len(frames)) for index in run)
     return [([frames[k] for k in window], place) for window, place in around]
+
+
+def too_large(error: BaseException, name: str) -> UserError | None:
+    """What to tell when there was no memory for the photo `name`; None when `error` is another fault."""
+    told = ("not enough memory", "can't allocate memory")  # torch's on processors
+    if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and not any(
+        words in str(error) for words in told
+    ):
+        return None
+    return UserError(
+        f"{name} is too large to be restored with the memory that is free.",
+        "Scale the photos down (ingest.max_size) and start from ingest, or end other programs.",
+    )
 
 
 def _planes(image: np.ndarray, device: torch.device) -> Tensor:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from pipeline.errors import UserError
 from pipeline.io.weights import read_state
-from pipeline.removal.wen import Frames
+from pipeline.removal.wen import Frames, mend
 
 # Channels of VGG's convolutions by its depth; 0 halves the size.
 VGG = {
@@ -76,9 +76,10 @@ def wen_loss(
 
     25 MSE + 25 MSE within the drops + 10 perceptual + 50 and 25 MSE at a quarter and half the size
     (of every fourth and second pixel) + 10 cross-entropy of the map of clear pixels. For single
-    pictures 5 cross-entropy, and the perceptual loss a second time on the picture whose clear
-    pixels are the photo's own; the plain MSE, which they lack there, stays: without a backbone
-    nothing else would hold the picture. rainy, clean (B,T,3,H,W) in [-1,1]; drops (B,T,1,H,W), 1 = drop.
+    pictures 5 cross-entropy, and the perceptual loss a second time on the photo where the map found
+    says clear and the picture elsewhere; the plain MSE, which they lack there, stays: without a
+    backbone nothing else would hold the picture.
+    rainy, clean (B,T,3,H,W) in [-1,1]; drops (B,T,1,H,W), 1 = drop.
     Source: Wen et al., ICRA 2023, and the weights in its released code.
     """
     target = clean.flatten(0, 1)
@@ -94,8 +95,8 @@ def wen_loss(
     if perceptual is not None:
         loss = loss + 10 * perceptual(full, target)
         if single:
-            mended = full * wet + rainy.flatten(0, 1) * (1 - wet)
-            loss = loss + 10 * perceptual(mended, target)
+            mended = mend(rainy, found.full, found.clear)
+            loss = loss + 10 * perceptual(mended.flatten(0, 1), target)
     return loss
 
 
@@ -108,6 +109,9 @@ def adversarial_map_loss(fake_map: Tensor, real_map: Tensor, attention: Tensor) 
 
 
 def least_squares(verdicts: Sequence[Tensor], truth: float) -> Tensor:
-    """The mean over scales of (verdict - truth)^2: the least-squares GAN (Mao et al., ICCV 2017)."""
+    """The sum over scales of the mean (verdict - truth)^2, as in the released code of Wen et al.
+
+    The least-squares GAN: Mao et al., ICCV 2017.
+    """
     each = [F.mse_loss(verdict, torch.full_like(verdict, truth)) for verdict in verdicts]
-    return torch.stack(each).mean()
+    return torch.stack(each).sum()

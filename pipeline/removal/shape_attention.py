@@ -22,14 +22,23 @@ DIRECTIONS = tuple((y / math.hypot(y, x), x / math.hypot(y, x)) for y, x in STEP
 def oriented_edges(rgb: Tensor, *, published: bool = True) -> Tensor:
     """Edges by orientation (N,8,H,W), 0 or 1, of pictures (N,3,H,W) in [0,1].
 
-    A pixel is an edge of orientation k when its difference to neighbour k is the largest of the
-    eight, above 10/255, and that neighbour's smallest difference points back. The released code
-    takes the opposite of k as ((k + 1) mod 4) + 1 within the four axial and the four diagonal
-    neighbours, which is never met for their third: with `published`, channels 4 and 5 stay empty
-    as they do there. (Its edges lie beside it as files; in which sense it counts columns was not
-    to be found out. Here an edge points at its darker side.)
+    As meant (`published` off): a pixel is an edge of orientation k when its difference to neighbour
+    k is the largest of the four axial, or the four diagonal ones, above 10/255, and that neighbour's
+    smallest difference points back. It points at its darker side. Outside of the picture is black.
+
+    As released (`published`), which weights trained with that code need: rows are counted the other
+    way than `torque` counts them, so that an edge whose upper side is darker points down; a diagonal
+    edge asks for the largest and smallest of the axial differences, and only its height is that of
+    the diagonal one; what is opposite to the third of four is never met, so that channels 4 and 5
+    stay empty. Source: amitedgefinder, findGradient and myShift in utils.py of the released code
+    (jackiesdd/raindropAttention), as its model calls them; its shifts are padded, so none wraps around.
     """
     grey = (rgb * rgb.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]).sum(1, keepdim=True)
+    return (_released_edges if published else _mended_edges)(grey).to(rgb.dtype)
+
+
+def _mended_edges(grey: Tensor) -> Tensor:
+    """`oriented_edges` as meant, of grey (N,1,H,W)."""
     found = [torch.zeros(0)] * 8
     for first in (0, 1):  # axial neighbours, then diagonal ones
         steps = STEPS[first::2]
@@ -38,9 +47,21 @@ def oriented_edges(rgb: Tensor, *, published: bool = True) -> Tensor:
         for k, step in enumerate(steps):
             edge = (largest == k) & (differences[:, k] > EDGE_STEP)
             neighbour = _shifted(smallest[:, None].to(grey.dtype) + 1, step)[:, 0]  # 0: outside
-            opposite = (k + 2) % 4 if not (published and k == 2) else 4
-            found[2 * k + first] = edge & (neighbour == opposite + 1)
-    return torch.stack(found, 1).to(rgb.dtype)
+            found[2 * k + first] = edge & (neighbour == (k + 2) % 4 + 1)
+    return torch.stack(found, 1)
+
+
+def _released_edges(grey: Tensor) -> Tensor:
+    """`oriented_edges` as released, of grey (N,1,H,W)."""
+    steps = [(-rows, columns) for rows, columns in STEPS]
+    axial = torch.cat([grey - _shifted(grey, step) for step in steps[::2]], 1)
+    largest, smallest = axial.argmax(1), axial.argmin(1, keepdim=True).to(grey.dtype)
+    found = []
+    for n, step in enumerate(steps):
+        k, difference = n // 2, (grey - _shifted(grey, step))[:, 0]
+        back = _shifted(smallest, step)[:, 0]  # 0 outside, where no opposite is 0
+        found.append((largest == k) & (difference > EDGE_STEP) & (back == (k + 1) % 4 + 1))
+    return torch.stack(found, 1)
 
 
 def _shifted(values: Tensor, step: tuple[int, int]) -> Tensor:

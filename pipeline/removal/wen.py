@@ -12,6 +12,7 @@ from torch.nn import functional as F
 MULTIPLE = 32
 WIDTH = 256
 FRAMES = 5
+WEIGHED = 2**25  # pairs of patches whose weights are held at a time: 128 MB, a few times over
 
 
 class Frames(NamedTuple):
@@ -33,8 +34,8 @@ class Features(NamedTuple):
 def mend(frames: Tensor, full: Tensor, clear: Tensor) -> Tensor:
     """The frames (...,3,H,W) where the map says that they are clear, and what was found elsewhere.
 
-    The picture that the released training compares once more for single photos, there with the true
-    map; the released program gives out `full` as it is.
+    The picture that the released training compares once more for single photos; the released program
+    gives out `full` as it is.
     """
     return frames * clear + full * (1 - clear)
 
@@ -130,10 +131,22 @@ class _PatchAttention(nn.Module):
         heads = []
         for patch, *parts in zip(self.patches, *split, strict=True):
             q, k, v = (_tokens(part, patch, groups) for part in parts)
-            weights = self.softmax(q @ k.transpose(1, 2) / math.sqrt(q.shape[-1]))
-            out = (weights @ v).view(len(own), -1, share * patch * patch).transpose(1, 2)
-            heads.append(F.fold(out, own.shape[-2:], patch, stride=patch))
+            out = self._attended(q, k, v).view(len(own), -1, share * patch * patch)
+            heads.append(F.fold(out.transpose(1, 2), own.shape[-2:], patch, stride=patch))
         return self.output_linear(torch.cat(heads, 1))
+
+    def _attended(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """The values that queries (groups,n,C) find: no more of them at a time than WEIGHED allows.
+
+        Each weighs all keys by itself, so that blocks of queries change nothing but the memory,
+        which would grow with the square of the picture's size.
+        """
+        most = max(1, WEIGHED // (k.shape[0] * k.shape[1]))
+        found = []
+        for part in q.split(most, 1):
+            weights = self.softmax(part @ k.transpose(1, 2) / math.sqrt(q.shape[-1]))
+            found.append(weights @ v)
+        return torch.cat(found, 1)
 
 
 def _tokens(part: Tensor, patch: int, groups: int) -> Tensor:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
 
-from pipeline.attention.inference import attend
+from pipeline.attention import inference
+from pipeline.attention.inference import attend, exact_products
 from pipeline.attention.network import AttentiveRecurrentNet
 
 
@@ -75,6 +78,31 @@ def test_the_same_bytes_every_time(network: AttentiveRecurrentNet) -> None:
     image = _image(33, 47)
     first, second = (attend(network, image, tile=20, steps=2) for _ in range(2))
     assert first.tobytes() == second.tobytes()
+
+
+def test_a_gpu_computes_exactly_as_long_as_any_thread_makes_maps(
+    network: AttentiveRecurrentNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flags belong to the process: none is put back while another map is being made."""
+    flags = ("benchmark", "deterministic", "allow_tf32")
+    loose, exact = (True, False, True), (False, True, False)
+
+    def set_now() -> tuple[bool, ...]:
+        return tuple(getattr(torch.backends.cudnn, name) for name in flags)
+
+    for name, value in zip(flags, loose, strict=True):
+        monkeypatch.setattr(torch.backends.cudnn, name, value)
+    attend(network, _image(8, 8), steps=1)
+    assert set_now() == loose  # a processor knows none of them
+    monkeypatch.setattr(inference, "exact_products", lambda _: exact_products(torch.device("cuda")))
+    during = []
+    whole = network.attention
+    monkeypatch.setattr(
+        network, "attention", lambda *given: (during.append(set_now()), whole(*given))[1]
+    )
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda k: attend(network, _image(8 + k, 40), steps=1, tile=8), range(8)))
+    assert set(during) == {exact} and set_now() == exact
 
 
 def test_nonsense_is_refused(network: AttentiveRecurrentNet) -> None:

@@ -104,6 +104,20 @@ def test_a_full_generator_fits_and_extra_tensors_are_ignored(
         assert torch.equal(value, network.state_dict()[name])
 
 
+def test_a_whole_generator_made_here_gives_its_attention_part(
+    network: AttentiveRecurrentNet, tmp_path: Path
+) -> None:
+    """It says that it is for attgan, of which the attentive network is a part, and the U-Net is not."""
+    state = {**network.state_dict(), "conv1.0.weight": torch.zeros(64, 4, 5, 5)}
+    halves = {name: value.half() for name, value in state.items()}
+    save_tensors(tmp_path / "attgan.safetensors", halves, {"model": "attgan"})
+    loaded = load_network(tmp_path / "attgan.safetensors").state_dict()
+    assert loaded.keys() == network.state_dict().keys()
+    assert all(torch.equal(value, halves[name].float()) for name, value in loaded.items())
+    with pytest.raises(UserError, match="is for the detector 'attgan', not for 'unet'"):
+        load_network(tmp_path / "attgan.safetensors", "unet")
+
+
 def test_missing_and_misshapen_tensors_are_named(
     network: AttentiveRecurrentNet, tmp_path: Path
 ) -> None:

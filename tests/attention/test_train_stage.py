@@ -137,6 +137,16 @@ def test_trained_weights_are_averaged_with_others_and_scored_anew(root: Path) ->
             main(job, PARAMS.model_copy(update={"average": shares}))
 
 
+def test_validation_sets_of_one_name_are_told(root: Path) -> None:
+    """The curve would show one of them."""
+    job = Job(root, "made", None, "cpu", None, False)
+    for folders, name in ((["rendered", "other/rendered"], "rendered"), (["painted"], "painted")):
+        with pytest.raises(UserError, match=f"Two validation sets are called {name}"):
+            train_detector._validation(
+                job, PARAMS.model_copy(update={"validation_rendered": folders})
+            )
+
+
 def test_painting_is_kept_and_depends_on_the_photos(root: Path) -> None:
     photos = pools.list_pictures(root / "photos")
     assert pools.painted_name(5, photos) != pools.painted_name(5, photos, kind="veils")

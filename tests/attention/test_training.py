@@ -23,11 +23,13 @@ from pipeline.attention.training import (
     count,
     fit,
     overlap_loss,
+    phases_of,
     score,
     scores,
 )
 from pipeline.attention.unet import DropUNet
 from pipeline.attention.weights import load_network
+from pipeline.drops.stills import LONGEST
 from pipeline.errors import UserError
 from pipeline.io.images import write_image
 from pipeline.io.tensors import load_tensors
@@ -221,6 +223,23 @@ def test_scores_at_each_threshold_by_hand() -> None:
     assert (high.precision, high.recall, high.iou) == (1, 0.5, 0.5)
 
 
+def test_a_single_pixel_is_nothing_to_normalise_over() -> None:
+    """At a sixteenth one crop of 16 pixels is one; two crops, or 17 pixels, are more."""
+
+    def told(batch: int, crop: int) -> list[dict[str, float]]:
+        return [{"steps": 1, "iterations": 1, "batch": batch, "crop": crop, "rate": 0.01}]
+
+    with pytest.raises(UserError, match="batches of one crop of 16 pixels"):
+        phases_of(DropUNet(), told(1, 16))
+    for batch, crop in ((2, 16), (1, 17)):
+        network = DropUNet()
+        network.initialise(0)
+        phases = phases_of(network, told(batch, crop))
+        trainer = Trainer(network, [_pool(2)], phases, seed=0, clean_share=0.0)
+        assert np.isfinite(trainer.advance())
+    assert phases_of(AttentiveRecurrentNet(), told(1, 16)) == [Phase(1, 1, 1, 16, 0.01)]
+
+
 def test_folders_of_pairs(tmp_path: Path) -> None:
     pool = _pool(2, 32)
     for k, (wet, dry, cover) in enumerate(zip(pool.rainy, pool.clean, pool.coverage, strict=True)):
@@ -239,6 +258,29 @@ def test_folders_of_pairs(tmp_path: Path) -> None:
         read_photo_pairs(tmp_path)
     with pytest.raises(UserError, match="no images"):
         read_rendered(tmp_path / "empty")
+
+
+def test_large_pairs_are_held_as_small_as_the_photos_that_are_painted_on(tmp_path: Path) -> None:
+    """Both partners are shrunk, then compared: one bright pixel of many is no water any more."""
+    dry = np.full((60, 2400, 3), 100, np.uint8)
+    wet = dry.copy()
+    wet[20:40, 400:800] += 60  # even after shrinking
+    wet[10, 2000] += 150
+    cover = np.zeros_like(dry)
+    cover[:, :1200] = 255
+    write_image(tmp_path / "data/0_rain.png", wet)
+    write_image(tmp_path / "gt/0_clean.png", dry)
+    for kind, picture in (("rainy", wet), ("clean", dry), ("coverage", cover)):
+        write_image(tmp_path / kind / "0.png", picture)
+    for read in (read_rendered, read_photo_pairs):
+        for part in read(tmp_path):
+            assert part[0].shape[:2] == (30, LONGEST)
+    seen = read_photo_pairs(tmp_path)[2][0]
+    assert seen[15, 200:400].min() == 255 and seen[:, 410:].max() == 0
+    assert (read_rendered(tmp_path)[2][0] == np.repeat([255, 0], 600)).all()
+    write_image(tmp_path / "gt/0_clean.png", dry[:, :1200])
+    with pytest.raises(UserError, match=r"0_rain\.png and its partners differ in size"):
+        read_photo_pairs(tmp_path)
 
 
 def _bricks_and_a_drop() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.drops import stains
 from pipeline.drops.creep import crept
 from pipeline.drops.shape import Drop
 from pipeline.drops.stains import NAMES, over, sample_stains, seen_layer, stained
@@ -21,6 +22,17 @@ def test_stains_cover_their_share_and_are_as_opaque_as_their_kind(kind: str) -> 
     assert (opacity.max() > 0.91) == opaque
     again = sample_stains(np.random.default_rng(1), kind, (200, 260), 0.12, 3.0)
     np.testing.assert_array_equal(layer, again)
+
+
+def test_a_share_that_is_not_reached_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a pane of 100x100 pixels, a hundred specks of dust hide some; what is missing is not passed over."""
+    monkeypatch.setattr(stains, "MOST", 100)
+    some = sample_stains(np.random.default_rng(1), "dust", (100, 100), 0.01, 1.0)
+    reached = (some[..., 3] > 0.1).mean()
+    assert 0.01 <= reached < 0.02
+    told = r"100 stains of kind dust cover only \d\.\d\d% of the pane, not 90\.00%"
+    with pytest.raises(UserError, match=told):
+        sample_stains(np.random.default_rng(1), "dust", (100, 100), 0.9, 1.0)
 
 
 def test_unknown_stain_is_refused() -> None:

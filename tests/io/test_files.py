@@ -297,6 +297,33 @@ def test_archives_of_weights(tmp_path: Path) -> None:
             read_state(path)
 
 
+def test_weights_as_a_trainer_of_waterdrop_removal_saves_them(tmp_path: Path) -> None:
+    """Wen et al.'s: the state dict under `network`, beside those of optimiser and scheduler."""
+    network = torch.nn.Conv2d(3, 2, 1)
+    optimiser = torch.optim.Adam(network.parameters(), betas=(0.0, 0.999))
+    network(torch.ones(1, 3, 1, 1)).sum().backward()
+    optimiser.step()
+    whole = {
+        "network": network.state_dict(),
+        "optimizer": optimiser.state_dict(),
+        "scheduler": torch.optim.lr_scheduler.StepLR(optimiser, 50_000, 0.5).state_dict(),
+    }
+    torch.save(whole, tmp_path / "75000_state_G.pth")
+    state = read_state(tmp_path / "75000_state_G.pth")
+    assert state.keys() == {"weight", "bias"}
+    assert all(torch.equal(state[name], value) for name, value in network.state_dict().items())
+
+
+def test_tensors_without_names_are_told(tmp_path: Path) -> None:
+    for state in (
+        {0: torch.zeros(2)},
+        {"state_dict": {"a": torch.zeros(2), (1, 2): torch.ones(1)}},
+    ):
+        torch.save(state, tmp_path / "numbers.pt")
+        with pytest.raises(UserError, match=r"numbers\.pt holds tensors without names \(the first"):
+            read_state(tmp_path / "numbers.pt", "Set it.")
+
+
 def test_weights_that_overflow_are_not_finite(tmp_path: Path) -> None:
     network = torch.nn.Linear(1, 1)
     state = {"weight": torch.full((1, 1), 1e300, dtype=torch.float64), "bias": torch.zeros(1)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ from pipeline.removal.clean import (
     clean_quan,
     clean_wen,
     clean_wen_run,
+    too_large,
     window_around,
     windows_of,
 )
 from pipeline.removal.precision import in_half, keep_exact, products
 from pipeline.removal.quan import QuanNet
+from pipeline.removal.record import edges_of
 from pipeline.removal.wen import WenNet
 from stages import restore
 
@@ -168,10 +171,12 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run_stage(root: Path, weights: str, method: str = "attgan", precision: str = "auto") -> int:
+def run_stage(
+    root: Path, weights: str, method: str = "attgan", precision: str = "auto", edges: str = "true"
+) -> int:
     (root / "p").write_text(
         f"scenes: {{glass: {{}}}}\n"
-        f'restore: {{method: {method}, weights: "{weights}", published_edges: true, '
+        f'restore: {{method: {method}, weights: "{weights}", published_edges: {edges}, '
         f"keep_clear: true, precision: {precision}}}\n"
     )
     with pytest.raises(SystemExit) as stop:
@@ -200,6 +205,26 @@ def test_every_photo_is_restored(scene: Path) -> None:
     assert np.array_equal(read_image(out / "a.png"), first)
 
 
+def test_weights_that_say_their_edges_are_not_used_with_others(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files that say nothing pass: the published ones, and those of before."""
+    state = QuanNet().state_dict()
+    save_tensors(scene / "silent.safetensors", state, {"model": "quan"})
+    save_tensors(scene / "meant.safetensors", state, {"model": "quan", "published_edges": "false"})
+    torch.save(state, scene / "silent.pt")
+    for weights in ("silent.safetensors", "silent.pt", "meant.safetensors"):
+        assert run_stage(scene, weights, "quan", edges="false") == 0
+    assert run_stage(scene, "silent.safetensors", "quan", edges="true") == 0
+    capsys.readouterr()
+    assert run_stage(scene, "meant.safetensors", "quan", edges="true") == 2
+    told = capsys.readouterr().err
+    assert "meant.safetensors was trained with published_edges: false, and" in told
+    assert "Set restore.published_edges to false" in told
+    assert edges_of(scene / "meant.safetensors") is False
+    assert edges_of(scene / "silent.safetensors") is edges_of(scene / "silent.pt") is None
+
+
 def test_wen_restores_runs_and_names_the_photo_that_fails(
     scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,6 +244,30 @@ def test_wen_restores_runs_and_names_the_photo_that_fails(
     (scene / "artifacts/glass/images/b.png").write_text("no photo")
     assert run_stage(scene, "wen.safetensors", "wen") == 2
     assert "b.png is not a readable image" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "fault", [lambda: torch.empty(2**60), lambda: np.empty(2**50), torch.OutOfMemoryError]
+)
+def test_photos_too_large_for_the_memory_are_told_in_a_sentence(
+    scene: Path,
+    fault: Callable[[], Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def cleaned(*_: Any, **__: Any) -> np.ndarray:
+        made = fault()
+        raise made if isinstance(made, Exception) else AssertionError
+
+    save_tensors(scene / "quan.safetensors", QuanNet().state_dict())
+    monkeypatch.setattr(restore, "clean_quan", cleaned)
+    assert run_stage(scene, "quan.safetensors", "quan") == 2
+    told = capsys.readouterr().err
+    assert ".png is too large to be restored" in told and "ingest.max_size" in told
+
+
+def test_other_faults_stay_faults_of_the_program() -> None:
+    assert too_large(RuntimeError("shapes do not match"), "a.png") is None
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from pipeline.removal import wen
 from pipeline.removal.autoencoder import ContextualAutoencoder, Scales, multi_scale_loss
 from pipeline.removal.quan import QuanNet, _Same, from_tensorflow, tensorflow_name
 from pipeline.removal.shape_attention import KERNELS, oriented_edges, shape_attention, torque
@@ -126,13 +128,65 @@ def test_no_edges_no_attention_and_only_steps_above_ten_count() -> None:
     assert float(oriented_edges(disc(10.0, 0.5 - 12 / 255)).sum()) > 0.0
 
 
-def test_two_channels_stay_empty_in_the_published_edges() -> None:
-    picture = disc(12.0, 0.0)
-    published, mended = oriented_edges(picture)[0], oriented_edges(picture, published=False)[0]
-    assert [k for k in range(8) if float(published[k].sum()) == 0] == [4, 5]
+def released(rgb: np.ndarray) -> np.ndarray:
+    """The released definition for one picture (H,W,3), a pixel at a time: channels (8,H,W)."""
+    red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    grey = np.float32(0.299) * red + np.float32(0.587) * green + np.float32(0.114) * blue
+    grey = np.pad(grey, 1)  # black around it
+    height, width = rgb.shape[:2]
+    # Clockwise from above, axial and diagonal ones in turn.
+    around = ((-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1))
+    steepest = np.full(
+        (*grey.shape, 2), -1
+    )  # of the axial ones: most and least; -1 around the picture
+    inside = [(y, x) for y in range(1, height + 1) for x in range(1, width + 1)]
+    for y, x in inside:
+        falls = [grey[y, x] - grey[y + rows, x + columns] for rows, columns in around[::2]]
+        steepest[y, x] = int(np.argmax(falls)), int(np.argmin(falls))
+    found = np.zeros((8, height, width))
+    for y, x in inside:
+        for channel, (rows, columns) in enumerate(around):
+            fall = grey[y, x] - grey[y + rows, x + columns]
+            k, there = channel // 2, steepest[y + rows, x + columns, 1]
+            opposite = {0: 2, 1: 3, 2: 4, 3: 1}[k]  # 4 does not exist: it should be 0
+            if steepest[y, x, 0] == k and there == opposite and fall > 10 / 255:
+                found[channel, y - 1, x - 1] = 1
+    return found
+
+
+@pytest.mark.parametrize("levels", [3, 9, 256])
+def test_published_edges_are_those_of_the_released_code(levels: int) -> None:
+    """Of few levels too, where several differences are the largest: the first of them counts."""
+    rng = np.random.default_rng(levels)
+    greys = [(rng.integers(0, levels, (12, 15, 1)) / (levels - 1)).repeat(3, 2) for _ in range(2)]
+    smooth = cv2.GaussianBlur(rng.random((12, 15, 3)), (0, 0), 1.5)
+    whole = np.zeros(8)
+    for picture in (*greys, rng.random((12, 15, 3)), (smooth - smooth.min()) * 2):
+        rgb = np.asarray(picture, np.float32)
+        edges = oriented_edges(torch.from_numpy(rgb.transpose(2, 0, 1).copy())[None])[0].numpy()
+        assert np.array_equal(edges, released(rgb))
+        whole += edges.sum((1, 2))
+    assert list(np.flatnonzero(whole == 0)) == [4, 5]
+
+
+def test_published_edges_count_rows_the_other_way() -> None:
+    """An edge points at its darker side, to the right as to the left; up and down as released."""
+    dark_below = torch.full((1, 3, 8, 8), 0.2)
+    dark_below[:, :, :4] = 0.7
+    assert oriented_edges(dark_below, published=False)[0, 0, 3, 2:6].tolist() == [1, 1, 1, 1]
+    assert float(oriented_edges(dark_below)[0, :, 2:6, 2:6].sum()) == 0  # channel 4, always empty
+    dark_above = dark_below.flip(2)
+    assert oriented_edges(dark_above, published=False)[0, 4, 4, 2:6].tolist() == [1, 1, 1, 1]
+    assert oriented_edges(dark_above)[0, 0, 4, 2:6].tolist() == [1, 1, 1, 1]
+    dark_right = dark_below.transpose(2, 3)
+    for published in (True, False):
+        edges = oriented_edges(dark_right, published=published)
+        assert edges[0, 2, 2:6, 3].tolist() == [1, 1, 1, 1]
+
+
+def test_mended_edges_fill_all_channels() -> None:
+    mended = oriented_edges(disc(12.0, 0.0), published=False)[0]
     assert all(float(mended[k].sum()) > 0 for k in range(8))
-    kept = [0, 1, 2, 3, 6, 7]
-    assert torch.equal(published[kept], mended[kept])
 
 
 def test_torque_of_one_edge_is_its_distance_over_the_fourth_power() -> None:
@@ -164,6 +218,27 @@ def test_a_single_patch_attends_to_itself_alone() -> None:
     expected = mixed.view(2, 2, 128, 4, 4).permute(2, 0, 3, 1, 4).reshape(128, 8, 8)
     assert torch.allclose(heads[0][0, :128], value[0, :128], atol=1e-5)
     assert torch.allclose(heads[0][0, 128:], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("most", [1, 100, 1000])
+def test_patches_that_ask_in_blocks_find_the_same(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two groups of two frames, of 4 and 16 patches each; the last block is a shorter one."""
+    torch.manual_seed(3)
+    layer = _PatchAttention((8, 4)).eval()
+    x = torch.randn(4, 256, 16, 16)
+    held = []
+    layer.softmax.register_forward_hook(lambda *call: held.append(call[2].numel()))
+    with torch.inference_mode():
+        whole, alone = layer(x, 2), layer(x, 2, x[::2])
+        assert held == [2 * 8 * 8, 2 * 32 * 32, 2 * 4 * 8, 2 * 16 * 32]
+        held.clear()
+        monkeypatch.setattr(wen, "WEIGHED", most)
+        assert torch.allclose(layer(x, 2), whole, atol=1e-6)
+        assert torch.allclose(layer(x, 2, x[::2]), alone, atol=1e-6)
+    assert max(held) <= max(most, 2 * 32)  # a single query's at least
+    assert len(held) > 4
 
 
 def test_frames_attend_to_each_other_only_in_the_temporal_blocks() -> None:

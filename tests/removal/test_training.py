@@ -15,13 +15,14 @@ from pipeline.attention.network import AttentiveRecurrentNet
 from pipeline.attention.training import attention_loss
 from pipeline.errors import UserError
 from pipeline.geometry.crops import resident
-from pipeline.io.tensors import save_tensors
+from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.removal import clips, training
 from pipeline.removal.autoencoder import Scales, multi_scale_loss
 from pipeline.removal.critics import AttentiveCritic, PatchCritic, Verdict
-from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, wen_loss
+from pipeline.removal.losses import PerceptualLoss, adversarial_map_loss, least_squares, wen_loss
 from pipeline.removal.recipes import Added, AnyRecipe, recipe_of, weights_of
 from pipeline.removal.samples import Pairs, draw_batch, draw_resident, drop_map
+from pipeline.removal.store import save_remover
 from pipeline.removal.training import Phase, Plan, Trainer, fit
 from pipeline.removal.wen import Frames, mend
 from tests.answers import answers
@@ -104,6 +105,31 @@ def test_losses_are_zero_at_the_truth() -> None:
     assert float(wen_loss(truth._replace(clear=drops), clean, clean, drops)) > 100
 
 
+def test_single_pictures_are_compared_once_more_as_their_map_mends_them() -> None:
+    """With the map that was found, not the true one, so that it learns from it; clips are compared once."""
+    seen: list[torch.Tensor] = []
+
+    class Spy(torch.nn.Module):
+        def forward(self, found: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+            seen.append(found)
+            return (found - wanted).square().mean()
+
+    for frames in (1, 5):
+        clean, drops = torch.zeros(1, frames, 3, 32, 32), torch.zeros(1, frames, 1, 32, 32)
+        rainy, full = clean + 0.8, clean + 0.2
+        clear = torch.full_like(drops, 0.25, requires_grad=True)
+        flat = clean.flatten(0, 1)
+        found = Frames(flat[..., ::4, ::4], flat[..., ::2, ::2], full, clear)
+        seen.clear()
+        plain, whole = (wen_loss(found, rainy, clean, drops, spy) for spy in (None, Spy()))
+        added = whole - plain
+        again = 10 * 0.35**2 if frames == 1 else 0  # a quarter of 0.8 and three of 0.2
+        assert added.item() == pytest.approx(10 * 0.2**2 + again, rel=1e-4)
+        added.backward()
+        assert clear.grad is not None and bool((clear.grad > 1e-6).all()) == (frames == 1)
+        assert len(seen) == (2 if frames == 1 else 1) and torch.equal(seen[0], full.flatten(0, 1))
+
+
 def test_the_map_of_wen_is_judged_in_full_precision_outside_autocast(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -146,6 +172,26 @@ def test_what_is_added_to_the_published_losses_is_added() -> None:
     assert mended[0, 0, 0].tolist() == [[0, 1], [0.75, 0.5]]
 
 
+def test_weights_say_how_they_were_trained(tmp_path: Path) -> None:
+    """Which edges quan saw, and whether wen's photo was mended; attgan has neither."""
+    how = {"attention": None, "map_loss": attention_loss, "train_attention": False, "steps": 1}
+    told = []
+    for method, edges, mended in (
+        ("quan", True, 0), ("quan", False, 0), ("wen", True, 0), ("wen", True, 50),
+    ):  # fmt: skip
+        made = recipe_of(method, 0, published_edges=edges, added=Added(0, 0, mended), **how)  # type: ignore[arg-type]
+        save_remover(tmp_path / "w.safetensors", made, method)
+        told.append(load_tensors(tmp_path / "w.safetensors")[1])
+    assert told == [
+        {"model": "quan", "published_edges": "true"},
+        {"model": "quan", "published_edges": "false"},
+        {"model": "wen", "mended": "false"},
+        {"model": "wen", "mended": "true"},
+    ]
+    save_remover(tmp_path / "w.safetensors", recipe("attgan"), "attgan")
+    assert load_tensors(tmp_path / "w.safetensors")[1] == {"model": "attgan"}
+
+
 def test_the_discriminators_maps_are_to_be_the_generators_and_nothing() -> None:
     attention = torch.rand(1, 1, 8, 8)
     nothing = torch.zeros(1, 1, 8, 8)
@@ -186,6 +232,16 @@ def test_patches_are_judged_at_three_scales_and_squares_vanish_at_the_truth() ->
     assert float(critic.fooled(torch.ones(2, 2))) == 0
     assert float(critic.loss(torch.zeros(2, 2), torch.ones(2, 2), torch.zeros(1))) == 0
     assert float(critic.loss(torch.ones(2, 2), torch.zeros(2, 2), torch.zeros(1))) == 1
+    # Of several scales, each a mean over its patches, the sum: 1 + 4 + 9.
+    scales = [
+        torch.full((1, 1, size, size), value) for size, value in ((8, 1.0), (4, 2.0), (2, 3.0))
+    ]
+    assert float(least_squares(scales, 0.0)) == 14
+    critic.forward = lambda frames: [scale * frames for scale in scales]  # type: ignore[method-assign]
+    assert float(critic.fooled(torch.zeros(1))) == 3
+    assert float(critic.loss(torch.ones(1), torch.ones(1), torch.zeros(1))) == 0.5 * (
+        14 + 0 + 1 + 4
+    )
 
 
 @pytest.mark.parametrize(("method", "depth"), [("attgan", (64, 64, 0, 128, 128)),
