@@ -25,6 +25,7 @@ from pipeline.sfm.model import (
     views_of,
 )  # fmt: skip
 from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
+from pipeline.sfm.turning import turns_alone
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +42,7 @@ class _Try:
     settings: Settings
     models: list[pycolmap.Reconstruction]
     matching: Matching
+    turned: bool = False  # whether a model was left out because turning on the spot explains it
 
     @property
     def best(self) -> pycolmap.Reconstruction | None:
@@ -108,7 +110,8 @@ def reconstruct(
             database, image_dir, work_dir, len(names), attempt, seed=seed, progress=report
         )
         models = [model for model in models if usable(model, len(names))]
-        tries.append(_Try(label, attempt, models, matching))
+        moved = [model for model in models if not turns_alone(model, database)]
+        tries.append(_Try(label, attempt, moved, matching, len(moved) < len(models)))
         log.info("attempt (%s): %d of %d photos placed", label, tries[-1].registered, len(names))
         if best is None or tries[-1].beats(best):
             best = tries[-1]
@@ -257,6 +260,12 @@ def _lost_images(best: _Try, names: Sequence[str]) -> list[LostImage]:
 def _no_model(matching: Matching, tries: Sequence[_Try], image_dir: Path) -> tuple[str, str]:
     """What to say when no attempt gave a model."""
     tried = f"Tried: {', '.join(one.label for one in tries)}."
+    if any(one.turned for one in tries):
+        return (
+            f"the poses found for {image_dir} cannot be right: turning on the spot explains all matches. "
+            f"{tried}",
+            "Photos from different places are needed, with more overlap.",
+        )
     if max(matching.keypoints.values()) < FEWEST_FEATURES:
         most = max(matching.keypoints, key=lambda name: matching.keypoints[name])
         return (

@@ -14,12 +14,14 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.geometry.poses import pose_errors
+from pipeline.geometry.trajectory import look_at
 from pipeline.io.images import read_image, write_image
 from pipeline.io.masks import write_keep_mask
 from pipeline.sfm import Settings, reconstruct, write_sparse
 from pipeline.sfm.mapping import map_images
 from pipeline.sfm.model import largest, usable, views_of
 from pipeline.sfm.reconstruct import ladder
+from tests.planes import draw
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 SETTINGS = Settings(
@@ -208,9 +210,10 @@ def test_one_photo_taken_several_times_is_refused(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("count", "k1", "good"), [(3, 0.1, True), (2, 0.1, False), (3, 9.0, False)]
+    ("count", "k1", "points", "good"),
+    [(3, 0.1, 15, True), (2, 0.1, 15, False), (3, 9.0, 15, False), (3, 0.1, 14, False)],
 )
-def test_models_of_two_photos_or_an_impossible_lens_count_for_nothing(count, k1, good):
+def test_models_of_too_little_or_an_impossible_lens_count_for_nothing(count, k1, points, good):
     """At f = 220 the corner of 240 x 180 lies at r^2 = (120^2 + 90^2) / 220^2 = 0.46."""
     model = pycolmap.Reconstruction()
     params = [FOCAL, WIDTH / 2, HEIGHT / 2, k1]
@@ -219,9 +222,40 @@ def test_models_of_two_photos_or_an_impossible_lens_count_for_nothing(count, k1,
     )
     model.add_camera_with_trivial_rig(camera)
     for number in range(1, count + 1):
-        image = pycolmap.Image(name=f"{number}", camera_id=1, image_id=number)
+        image = pycolmap.Image(
+            name=f"{number}", keypoints=np.zeros((points, 2)), camera_id=1, image_id=number
+        )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for index in range(points):
+        seen = [pycolmap.TrackElement(number, index) for number in range(1, count + 1)]
+        model.add_point3D(np.array([0.0, 0.0, 5.0]), pycolmap.Track(seen), np.zeros(3, np.uint8))
     assert usable(model, 20) == good
+
+
+def drawn(folder: Path, cams, **how) -> list[str]:
+    """Pictures of the planes with a little noise, as a camera makes them."""
+    random = np.random.default_rng(0)
+    for name, cam in cams.items():
+        picture = draw(cam, **how)
+        write_image(folder / name, np.clip(picture + random.normal(0, 0.004, picture.shape), 0, 1))
+    return sorted(cams)
+
+
+@pytest.mark.parametrize("focal_px", [{}, {f"{i}.png": FOCAL for i in range(6)}])
+def test_turning_on_the_spot_is_refused(tmp_path, focal_px):
+    """With a free lens the solver finds cameras that move before a far wall; with the right focal length, the
+    global mapper places photos that see two points between them."""
+    ahead = [(-0.8 + 0.32 * i, 0.25 * (-1) ** i, 4.0) for i in range(6)]
+    cams = {
+        f"{i}.png": look_at(np.zeros(3), np.array(place), np.array([0.0, 1.0, 0.0]))
+        for i, place in enumerate(ahead)
+    }
+    names = drawn(tmp_path, cams)
+    free = dataclasses.replace(SETTINGS, refine_focal=True, refine_distortion=True)
+    with pytest.raises(UserError, match="turning on the spot"):
+        reconstruct(
+            tmp_path, None, names, work_dir=tmp_path / "w", settings=free, focal_px=focal_px
+        )
 
 
 def test_a_single_photo_is_refused(scene, tmp_path):
