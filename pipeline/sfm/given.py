@@ -21,6 +21,7 @@ from pipeline.sfm.database import Progress, build_database
 from pipeline.sfm.model import points_of, with_depths
 from pipeline.sfm.reconstruct import check_inputs, silent
 from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
+from pipeline.sfm.whole import refuse_cut_short
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ def read_colmap(folder: Path, photos: Sequence[Path]) -> list[GivenView]:
     expressed, or a model of other photos.
     """
     try:
+        refuse_cut_short(folder)
         model = pycolmap.Reconstruction(str(folder))
     except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
         raise UserError(f"{folder} is not a readable COLMAP model ({error}).") from None
@@ -86,9 +88,16 @@ def _given(folder: Path, photo: Path, image: pycolmap.Image) -> GivenView:
     params = [float(value) for value in camera.params]
     bent = dict(zip(names, params[focals + 2 :], strict=True))
     order = _ORDER_FISHEYE if fisheye else _ORDER
+    try:
+        pose = as_4x4(image.cam_from_world().matrix())
+    except (RuntimeError, ValueError):  # the rig has a pose, its camera none on it
+        raise UserError(
+            f"{folder} does not tell where on its rig the camera of {photo.name} is.",
+            "Calibrate the rig first, or take that camera's photos away.",
+        ) from None
     view = GivenView(
         photo=photo,
-        cam_from_world=as_4x4(image.cam_from_world().matrix()),
+        cam_from_world=pose,
         width=int(camera.width),
         height=int(camera.height),
         fx=params[0],

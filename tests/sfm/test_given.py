@@ -196,9 +196,58 @@ def test_a_model_of_other_photos_and_a_damaged_one_are_refused(scene, tmp_path):
     write_image(tmp_path / "other.png", np.zeros((HEIGHT, WIDTH, 3)))
     with pytest.raises(UserError, match="places none of the photos"):
         read_colmap(tmp_path, [tmp_path / "other.png"])
-    (tmp_path / "images.bin").write_bytes(b"\x07\x00")
+    (tmp_path / "rigs.bin").write_bytes(b"\x01" + 19 * b"\x00")
     with pytest.raises(UserError, match="not a readable COLMAP model"):
         read_colmap(tmp_path, [scene.images / "v0.png"])
+
+
+@pytest.fixture(scope="module")
+def rigged(tmp_path_factory) -> tuple[Path, list[Path]]:
+    """A binary model of two cameras on a rig at three places, and its photos."""
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=20
+    )
+    folder = tmp_path_factory.mktemp("rigged")
+    pycolmap.set_random_seed(1)
+    model = pycolmap.synthesize_dataset(options)
+    model.write_binary(str(folder))
+    return folder, [Path(image.name) for image in model.images.values()]
+
+
+@pytest.mark.parametrize("part", ["cameras", "rigs", "frames", "images", "points3D"])
+def test_a_binary_model_that_is_cut_short_is_refused_wherever_it_is_cut(rigged, tmp_path, part):
+    """pycolmap waits for ever for some of them, and reads others with numbers that are not there."""
+    folder, photos = rigged
+    assert len(read_colmap(folder, photos)) == 6
+    shutil.copytree(folder, tmp_path / "m")
+    whole = (folder / f"{part}.bin").read_bytes()
+    for size in (0, 3, 8, 9, 15, 67, 80, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "m" / f"{part}.bin").write_bytes(whole[:size])
+        with pytest.raises(UserError, match=rf"{part}\.bin is cut short"):
+            read_colmap(tmp_path / "m", photos)
+
+
+def test_counts_of_millions_of_millions_are_refused_at_once(rigged, tmp_path):
+    folder, photos = rigged
+    shutil.copytree(folder, tmp_path / "m")
+    whole = (folder / "points3D.bin").read_bytes()
+    track = 8 + 43  # where the first point's count of its track stands
+    (tmp_path / "m/points3D.bin").write_bytes(whole[:track] + b"\xff" * 8 + whole[track + 8 :])
+    with pytest.raises(UserError, match="cut short"):
+        read_colmap(tmp_path / "m", photos)
+
+
+def test_a_camera_without_a_place_on_its_rig_is_named(rigged, tmp_path):
+    folder, photos = rigged
+    model = pycolmap.Reconstruction(str(folder))
+    model.write_text(str(tmp_path))
+    lines = (tmp_path / "rigs.txt").read_text().splitlines()
+    head, sensor = lines[-1].split(" CAMERA ")[:2], lines[-1].split(" CAMERA ")[2].split()[0]
+    (tmp_path / "rigs.txt").write_text(
+        "\n".join([*lines[:-1], " CAMERA ".join([*head, f"{sensor} 0"])])
+    )
+    with pytest.raises(UserError, match=r"where on its rig the camera of camera000002_"):
+        read_colmap(tmp_path, photos)
 
 
 def test_a_capture_with_poses_and_masks_goes_through_the_stages(scene, tmp_path):
