@@ -41,6 +41,7 @@ _MODELS: dict[str, tuple[int, tuple[str, ...], bool]] = {
 # Shares of matched features that become points. Measured: 0.77 and 0.83 with right poses, 0.12 and 0.06
 # with each photo's pose given to its neighbour or to the fifth from it.
 MISFIT, DOUBTFUL = 0.2, 0.5
+MANY_VIEWS, NEIGHBOURS = 60, 20  # of more views than that, each is matched with its nearest
 MOST_OFF_PX = 1.0  # that rounding to 32 bits may move what the cameras see
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _ORDER_FISHEYE = ("k1", "k2", "k3", "k4")
@@ -136,9 +137,10 @@ def triangulate(
     work_dir.mkdir(parents=True, exist_ok=True)
     report = progress if progress is not None else silent
     database = work_dir / "database.db"
+    near = nearest_pairs(given) if settings.matcher == "exhaustive" else None
     matching = build_database(
         database, image_dir, mask_dir, sizes, {}, settings,
-        seed=seed, threads=threads, progress=report,
+        seed=seed, threads=threads, progress=report, pairs=near,
     )  # fmt: skip
     report("triangulating", 0, 1)
     model = _with_points(_posed_model(database, given), database, image_dir, work_dir, seed)
@@ -177,6 +179,29 @@ def _of_these(
             "Run `python -m stages.ingest` again, or set poses.use_given: false.",
         )
     return found
+
+
+def nearest_pairs(given: Mapping[str, View]) -> list[tuple[str, str]] | None:
+    """Which of many views are matched, by name: each with its NEIGHBOURS nearest; None for all, of few.
+
+    A turn by a radian is as far as the views' mean distance from their midst.
+    """
+    names = sorted(given)
+    if len(names) <= MANY_VIEWS or any(
+        name.startswith("#") for name in names
+    ):  # a remark in a list
+        return None
+    centres = np.stack([centre(given[name].cam_from_world) for name in names])
+    ahead = np.stack([given[name].cam_from_world[2, :3] for name in names])
+    extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    pairs = set()
+    for index, name in enumerate(names):
+        away = np.linalg.norm(centres - centres[index], axis=1) / max(extent, 1e-12)
+        away += np.arccos(np.clip(ahead @ ahead[index], -1.0, 1.0))
+        away[index] = np.inf
+        nearest = np.argsort(away, kind="stable")[:NEIGHBOURS]
+        pairs |= {(min(name, names[other]), max(name, names[other])) for other in nearest}
+    return sorted(pairs)
 
 
 def _with_points(

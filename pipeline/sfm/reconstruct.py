@@ -14,7 +14,7 @@ import pycolmap
 from pipeline.errors import UserError
 from pipeline.io.images import image_size, read_image
 from pipeline.io.masks import read_keep_mask
-from pipeline.sfm.database import Progress, build_database
+from pipeline.sfm.database import Progress, build_database, pair_count
 from pipeline.sfm.mapping import map_images
 from pipeline.sfm.model import (
     implausible,
@@ -24,7 +24,14 @@ from pipeline.sfm.model import (
     usable,
     views_of,
 )  # fmt: skip
-from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
+from pipeline.sfm.result import (
+    LONG_VIDEO,
+    Attempt,
+    LostImage,
+    Matching,
+    Reconstructed,
+    Settings,
+)
 from pipeline.sfm.turning import turns_alone
 
 log = logging.getLogger(__name__)
@@ -34,6 +41,8 @@ FEWEST_FEATURES = 50
 # A later attempt that places more images wins, unless its error says that it placed them wrongly.
 WORSE_ERROR = 1.5
 FINE_ERROR_PX = 1.0
+# A pair takes 0.36 s of a slow core with twice the features: 2,000 are 12 minutes, all of 500 photos 12 hours.
+MANY_PAIRS, FEW_LOST = 2000, 0.05
 
 
 @dataclass(frozen=True)
@@ -97,10 +106,15 @@ def reconstruct(
     tries: list[_Try] = []
     best: _Try | None = None
     database = work_dir / "database.db"
-    rungs = ladder(settings, mask_dir is not None)
+    rungs = ladder(settings, mask_dir is not None, len(names))
     for label, attempt in rungs if retry else itertools.islice(rungs, 1):
         if tries and attempt.features_key() == tries[-1].settings.features_key():
             matching = tries[-1].matching
+        elif best is not None and not worth_matching(
+            attempt, len(names) - best.registered, len(names)
+        ):
+            _tell_given_up(best, names)
+            break
         else:
             matching = build_database(
                 database, image_dir, mask_dir, sizes, focal_px or {}, attempt,
@@ -125,8 +139,24 @@ def silent(phase: str, done: int, total: int) -> None:
     """Nothing: the progress of work that nobody watches."""
 
 
-def ladder(settings: Settings, masks_exist: bool) -> Iterator[tuple[str, Settings]]:
-    """The attempts in order, from what was asked for to what is left to try, each with its name."""
+def worth_matching(attempt: Settings, lost: int, total: int) -> bool:
+    """Whether photos are matched anew for `lost` ones of `total`: for few of many that takes too long."""
+    return lost >= FEW_LOST * total or pair_count(attempt.matcher, total) <= MANY_PAIRS
+
+
+def _tell_given_up(best: _Try, names: Sequence[str]) -> None:
+    placed = registered_names(best.best) if best.best is not None else []
+    log.warning(
+        "no further attempt is made to place %s: matching all photos again would take long",
+        ", ".join(name for name in names if name not in set(placed)),
+    )
+
+
+def ladder(settings: Settings, masks_exist: bool, total: int = 0) -> Iterator[tuple[str, Settings]]:
+    """The attempts in order, from what was asked for to what is left to try, each with its name.
+
+    Of `total` photos: of many every pair is matched only where that was asked for.
+    """
     yield "first", settings
     loose = replace(settings, loose=True)
     yield "placing on fewer matches", loose
@@ -135,7 +165,7 @@ def ladder(settings: Settings, masks_exist: bool) -> Iterator[tuple[str, Setting
         max_features=2 * settings.max_features,
         peak_threshold=settings.peak_threshold / 2,
         max_ratio=0.85,
-        matcher="exhaustive",
+        matcher=settings.matcher if total > LONG_VIDEO else "exhaustive",
     )
     yield "more and fainter features", more
     other = "incremental" if settings.mapper == "global" else "global"

@@ -14,13 +14,14 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline.errors import UserError
+from pipeline.geometry.trajectory import look_at
 from pipeline.io.capture import find_capture
 from pipeline.io.images import write_image
 from pipeline.io.masks import read_keep_mask, write_keep_mask
 from pipeline.io.ply import read_ply
 from pipeline.io.transforms import View, read_transforms, write_transforms
 from pipeline.sfm import Settings, read_colmap, triangulate
-from pipeline.sfm.given import _check_origin
+from pipeline.sfm.given import _check_origin, nearest_pairs
 from pipeline.stage import Job
 from stages import export, ingest, masks, poses
 
@@ -104,6 +105,48 @@ def test_given_poses_stay_and_points_tell_the_depths(scene, tmp_path):
     # The planes stand at 5, 3.6 and 2.9 metres along the world's z.
     off = np.abs(found.points_xyz[:, 2:] - [[5.0, 3.6, 2.9]]).min(axis=1)
     assert np.median(off) < 0.03
+
+
+def test_of_many_views_each_is_matched_with_its_nearest(scene):
+    """61 cameras on a circle around a thing: ten to either side, so 610 pairs instead of 1830."""
+    circle = {}
+    for index in range(61):
+        angle = 2 * np.pi * index / 61
+        place = np.array([np.sin(angle), 0.0, -np.cos(angle)]) * 5
+        pose = look_at(place, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+        circle[f"{index:02d}"] = dataclasses.replace(
+            true_views(scene)["v0.png"], name=f"{index:02d}", cam_from_world=pose
+        )
+    pairs = nearest_pairs(circle)
+    apart = [(int(b) - int(a)) % 61 for a, b in pairs]
+    assert len(pairs) == len(set(pairs)) == 610
+    assert max(min(steps, 61 - steps) for steps in apart) == 10
+    circle.popitem()
+    assert nearest_pairs(circle) is None
+
+
+def test_views_at_one_place_are_near_when_they_look_one_way(scene):
+    """Two hundred cameras on a tripod: none is matched with one that looks another way."""
+    turned = {}
+    for index in range(200):
+        angle = 2 * np.pi * index / 200
+        ahead = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        pose = look_at(np.zeros(3), ahead, np.array([0.0, 1.0, 0.0]))
+        turned[f"{index:03d}"] = dataclasses.replace(
+            true_views(scene)["v0.png"], name=f"{index:03d}", cam_from_world=pose
+        )
+    steps = [(int(b) - int(a)) % 200 for a, b in nearest_pairs(turned)]
+    assert max(min(step, 200 - step) for step in steps) == 10
+
+
+def test_only_listed_pairs_are_matched(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.sfm.given.MANY_VIEWS", 4)
+    monkeypatch.setattr("pipeline.sfm.given.NEIGHBOURS", 1)
+    found = pass_on(scene, true_views(scene), tmp_path)
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        listed = len((tmp_path / "pairs.txt").read_text().splitlines())
+        assert 3 <= listed < 6 and database.num_verified_image_pairs() == listed
+    assert sorted(found.views) == scene.names
 
 
 def test_given_depths_stay_and_a_photo_without_a_pose_is_lost(scene, tmp_path):

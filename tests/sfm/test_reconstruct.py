@@ -20,7 +20,7 @@ from pipeline.io.masks import write_keep_mask
 from pipeline.sfm import Settings, reconstruct, write_sparse
 from pipeline.sfm.mapping import map_images
 from pipeline.sfm.model import largest, usable, views_of
-from pipeline.sfm.reconstruct import ladder
+from pipeline.sfm.reconstruct import ladder, worth_matching
 from tests.planes import draw
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
@@ -183,6 +183,42 @@ def test_attempts_grow_looser_and_leave_masks_to_the_last():
     assert [r.masked for r in rungs] == [True, True, True, True, False]
     assert rungs[1].features_key() == rungs[0].features_key() != rungs[2].features_key()
     assert [r.mapper for r in rungs][-2] == "global"
+
+
+def test_attempts_at_long_videos_match_neighbours_alone():
+    """Every pair of 500 frames with twice the features: 15 hours of a processor."""
+    film = dataclasses.replace(MASKED, matcher="sequential")
+    for total, matcher in ((100, "exhaustive"), (101, "sequential")):
+        rungs = [settings for _, settings in ladder(film, masks_exist=True, total=total)]
+        assert [r.matcher for r in rungs] == ["sequential"] * 2 + [matcher] * 3
+
+
+@pytest.mark.parametrize(
+    ("matcher", "lost", "total", "worth"),
+    [
+        ("exhaustive", 1, 63, True),  # 1953 pairs
+        ("exhaustive", 1, 64, False),  # 2016
+        ("exhaustive", 3, 64, False),
+        ("exhaustive", 4, 64, True),  # more than a twentieth
+        ("sequential", 1, 200, True),  # 2000
+        ("sequential", 1, 201, False),
+    ],
+)
+def test_few_lost_of_many_are_no_reason_to_match_all_again(matcher, lost, total, worth):
+    attempt = dataclasses.replace(SETTINGS, matcher=matcher)
+    assert worth_matching(attempt, lost, total) == worth
+
+
+def test_who_is_given_up_is_told(scene, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(sys.modules["pipeline.sfm.reconstruct"], "MANY_PAIRS", 9)
+    monkeypatch.setattr(sys.modules["pipeline.sfm.reconstruct"], "FEW_LOST", 0.3)
+    write_image(tmp_path / "blank.png", np.full((HEIGHT, WIDTH, 3), 0.5))
+    names = [*scene.names[:4], "blank.png"]
+    for name in scene.names[:4]:
+        shutil.copy(scene.images / name, tmp_path / name)
+    found = solve(tmp_path, names, tmp_path / "w")
+    assert [a.label for a in found.attempts] == ["first", "placing on fewer matches"]
+    assert "no further attempt is made to place blank.png" in caplog.text
 
 
 def test_photos_without_features_are_refused(tmp_path):
