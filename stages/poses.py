@@ -80,14 +80,13 @@ def _found(job: Job, params: Params, records: Sequence[ImageRecord]) -> sfm.Reco
             "settings": _settings(params, read_origin(paths.images).kind, len(records)),
             "progress": partial(_show, bar),
             "threads": cores(),
-            **params.model_dump(include={"depth_margin", "seed"}),
+            **params.model_dump(include={"depth_margin", "min_registered", "seed"}),
         }
         if params.use_given and given.is_file():
             log.info("the poses that came with the photos are kept; points are found for them")
             return sfm.triangulate(paths.images, masks, names, read_transforms(given), **common)
-        common |= params.model_dump(include={"min_registered", "retry"})
         common["focal_px"] = {record.name: record.focal_px for record in records if record.focal_px}
-        found = sfm.reconstruct(paths.images, masks, names, **common)
+        found = sfm.reconstruct(paths.images, masks, names, retry=params.retry, **common)
     if masks is None or not params.align_rounds:
         return found
     images = read_posed_images(paths.images, masks, found.views)

@@ -19,7 +19,7 @@ from pipeline.io.given import GivenView, checked_camera
 from pipeline.io.transforms import View
 from pipeline.sfm.database import Progress, build_database
 from pipeline.sfm.model import points_of, with_depths
-from pipeline.sfm.reconstruct import check_inputs, silent
+from pipeline.sfm.reconstruct import check_inputs, refuse_few, silent, tell_lost
 from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
 from pipeline.sfm.whole import refuse_cut_short
 
@@ -119,6 +119,7 @@ def triangulate(
     *,
     work_dir: Path,
     settings: Settings,
+    min_registered: float = 0.0,
     depth_margin: float = 0.2,
     seed: int = 0,
     threads: int = 1,
@@ -128,7 +129,8 @@ def triangulate(
 
     The points tell the depths where the views do not, and their error tells whether the poses are
     those of the photos. Images without a given pose are lost. Other arguments as in `reconstruct`.
-    UserError when masks are missing, the poses do not fit, or depths stay unknown.
+    UserError when masks are missing, fewer than the share `min_registered` have a pose, the poses do not
+    fit, or depths stay unknown.
     """
     names, settings = sorted(names), replace(settings, camera="per_image")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
@@ -142,6 +144,12 @@ def triangulate(
         database, image_dir, mask_dir, sizes, {}, settings,
         seed=seed, threads=threads, progress=report, pairs=near,
     )  # fmt: skip
+    lost = [_unposed(name, matching) for name in names if name not in given]
+    tell_lost(lost)
+    refuse_few(
+        len(given), lost, min_registered, image_dir,
+        "Find poses for the others too, set poses.use_given: false, or lower poses.min_registered.",
+    )  # fmt: skip
     report("triangulating", 0, 1)
     model = _with_points(_posed_model(database, given), database, image_dir, work_dir, seed)
     report("triangulating", 1, 1)
@@ -153,7 +161,7 @@ def triangulate(
     reprojection = model.compute_mean_reprojection_error() if len(xyz) else 0.0
     return Reconstructed(
         views=views,
-        lost=[_unposed(name, matching) for name in names if name not in given],
+        lost=lost,
         points_xyz=xyz,
         points_rgb=rgb,
         points_error=error,

@@ -216,8 +216,7 @@ def _result(
     image_dir: Path,
 ) -> Reconstructed:
     lost = _lost_images(best, names)
-    for image in lost:
-        log.warning("no pose for %s", image)
+    tell_lost(lost)
     if best.best is None:
         raise UserError(*_no_model(best.matching, tries, image_dir))
     views = views_of(best.best, depth_margin)
@@ -227,13 +226,10 @@ def _result(
             f"the poses found for {image_dir} cannot be right: {fault}.",
             "Photos from different places are needed, with more overlap.",
         )
-    if len(views) < min_registered * len(names):
-        raise UserError(
-            f"only {len(views)} of {len(names)} photos in {image_dir} could be placed "
-            f"({len(views) / len(names):.0%}, poses.min_registered is {min_registered:.0%}). "
-            f"Lost: {', '.join(map(str, lost))}.",
-            "Take photos with more overlap, or lower poses.min_registered.",
-        )
+    refuse_few(
+        len(views), lost, min_registered, image_dir,
+        "Take photos with more overlap, or lower poses.min_registered.",
+    )  # fmt: skip
     xyz, rgb, error = points_of(best.best)
     return Reconstructed(
         views=views,
@@ -257,6 +253,26 @@ def _result(
         settings=best.settings,
         model=best.best,
     )
+
+
+def tell_lost(lost: Sequence[LostImage]) -> None:
+    """Warns of each lost image."""
+    for image in lost:
+        log.warning("no pose for %s", image)
+
+
+def refuse_few(
+    placed: int, lost: Sequence[LostImage], share: float, image_dir: Path, hint: str
+) -> None:
+    """UserError, with `hint`, when less than `share` of all images is placed."""
+    total = placed + len(lost)
+    if placed < share * total:
+        raise UserError(
+            f"only {placed} of {total} photos in {image_dir} could be placed "
+            f"({placed / total:.0%}, poses.min_registered is {share:.0%}). "
+            f"Lost: {', '.join(map(str, lost))}.",
+            hint,
+        )
 
 
 def _model_sizes(one: _Try) -> list[int]:

@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 
 from pipeline.errors import UserError
 from pipeline.geometry.trajectory import look_at
-from pipeline.io.capture import find_capture
+from pipeline.io.capture import adopt, find_capture
 from pipeline.io.images import write_image
 from pipeline.io.masks import read_keep_mask, write_keep_mask
 from pipeline.io.ply import read_ply
@@ -48,9 +48,9 @@ def true_views(scene) -> dict[str, View]:
     }  # fmt: skip
 
 
-def pass_on(scene, views, work, names=None):
+def pass_on(scene, views, work, names=None, **more):
     names = names or scene.names
-    return triangulate(scene.images, None, names, views, work_dir=work, settings=SETTINGS)
+    return triangulate(scene.images, None, names, views, work_dir=work, settings=SETTINGS, **more)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_only_listed_pairs_are_matched(scene, tmp_path, monkeypatch):
     assert sorted(found.views) == scene.names
 
 
-def test_given_depths_stay_and_a_photo_without_a_pose_is_lost(scene, tmp_path):
+def test_given_depths_stay_and_a_photo_without_a_pose_is_lost(scene, tmp_path, caplog):
     views = {
         name: dataclasses.replace(view, near=1.5, far=7.0)
         for name, view in true_views(scene).items()
@@ -159,6 +159,14 @@ def test_given_depths_stay_and_a_photo_without_a_pose_is_lost(scene, tmp_path):
     assert {(view.near, view.far) for view in found.views.values()} == {(1.5, 7.0)}
     assert [image.name for image in found.lost] == ["v2.png"]
     assert "no pose" in str(found.lost[0])
+    assert "no pose for v2.png" in caplog.text
+
+
+def test_too_few_given_poses_are_refused(scene, tmp_path):
+    views = {name: view for name, view in true_views(scene).items() if name != "v2.png"}
+    assert len(pass_on(scene, views, tmp_path, min_registered=0.8).views) == 4
+    with pytest.raises(UserError, match=r"only 4 of 5 photos .*Lost: v2\.png"):
+        pass_on(scene, views, tmp_path, min_registered=0.81)
 
 
 def test_poses_of_other_photos_are_refused(scene, tmp_path):
@@ -199,6 +207,22 @@ def test_a_colmap_model_is_read_in_every_form(scene, tmp_path, form):
     view = capture.views["v1.png"].view("v1.png", (WIDTH // 2, HEIGHT // 2))
     assert np.allclose(view.cam_from_world, scene.cams["v1.png"], atol=1e-12)
     assert view.intrinsics == (FOCAL / 2, FOCAL / 2, 60.0, 45.0, 0.02)
+
+
+def test_of_models_that_did_not_come_together_the_fullest_is_taken(scene, tmp_path, caplog):
+    """COLMAP numbers them as they came about: 0 is the first, not the largest; 10 comes after 2."""
+    for number, kept in ((0, 2), (2, 5), (10, 4)):
+        folder = tmp_path / f"a/sparse/{number}"
+        model = _model(folder, scene, "SIMPLE_RADIAL", [FOCAL, 120.0, 90.0, 0.02])
+        for image in range(kept + 1, 6):
+            model.deregister_frame(model.image(image).frame_id)
+        model.write_binary(str(folder))
+    shutil.copytree(scene.images, tmp_path / "a/images")
+    capture = find_capture(tmp_path / "a", 3, read_colmap)
+    assert capture.model == tmp_path / "a/sparse/2" and list(capture.views) == scene.names
+    assert "holds 3 models; 2 is taken, which places most photos: 5 of 5" in caplog.text
+    adopt(tmp_path / "a", tmp_path / "b", 3, read_colmap)
+    assert find_capture(tmp_path / "b", 3, read_colmap).model == tmp_path / "b/sparse/2"
 
 
 def test_camera_models_keep_their_meaning(scene, tmp_path):
