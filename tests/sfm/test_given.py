@@ -342,6 +342,28 @@ def test_a_capture_with_poses_and_masks_goes_through_the_stages(scene, tmp_path)
     assert account["aligned"] is False
 
 
+@pytest.mark.parametrize(("align_rounds", "use_masks"), [(1, True), (0, True), (1, False)])
+def test_photos_too_large_to_be_aligned_are_told_before_features(
+    scene, tmp_path, monkeypatch, align_rounds, use_masks
+):
+    """And are let through where they are not aligned: a later stage tells."""
+    shutil.copytree(scene.images, tmp_path / "data/made")
+    job = Job(tmp_path, "made", None, "cpu", None, False)
+    params = YAML(typ="safe").load((Path(__file__).parents[2] / "params.yaml").read_text())
+    ingest.main(job, ingest.Params(**params["ingest"]))
+    job.paths.masks.mkdir(parents=True)
+    monkeypatch.setattr("pipeline.io.posed.free_memory", lambda: 5 * WIDTH * HEIGHT * 25 - 1)
+    monkeypatch.setattr("stages.poses.sfm.reconstruct", _began)
+    how = {**params["poses"], "align_rounds": align_rounds, "use_masks": use_masks}
+    told = "need about" if align_rounds and use_masks else "features"
+    with pytest.raises(UserError, match=told):
+        poses.main(job, poses.Params(**how))
+
+
+def _began(*words, **more):
+    raise UserError("features")
+
+
 def test_poses_in_coordinates_of_the_whole_earth_come_back_on_export(scene, tmp_path):
     """Metres of UTM: the fit's own world begins among the cameras, what is exported lies where it was."""
     utm = np.array([412345.678, 5_654_321.25, 312.5])
