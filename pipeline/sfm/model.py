@@ -17,10 +17,8 @@ from pipeline.io.transforms import View
 WIDEST_DEG = 170.0
 NARROWEST_DEG = 2.0
 MOST_BENT = 0.6  # |k1| r^2 in the corner; the widest lenses of action cameras reach about 0.4
-SMALLEST_MODEL = 3
-FEWEST_POINTS = (
-    15  # seen by an image, at the median: what placing one takes at least, see `mapping`
-)
+SMALLEST_MODEL = 3  # pycolmap's mappers place two photos nowhere
+FEWEST_POINTS = 15  # seen by an image, at the median; placing one takes as many
 DEPTH_PERCENTILES = (1.0, 99.0)
 SURE_VIEWS = 3  # a wrong match of two photos makes a point at any depth; a third photo rules it out
 
@@ -30,14 +28,13 @@ def largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstructio
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
-def usable(model: pycolmap.Reconstruction, total: int) -> bool:
-    """Whether a model of some of `total` images says anything: enough of them and of what they see, through
-    a possible lens.
+def usable(model: pycolmap.Reconstruction) -> bool:
+    """Whether a model says anything: enough images and of what they see, through a possible lens.
 
     A few photos of drops on the lens agree on scenes that no lens shows: two photos, k1 in the tens. The
     global mapper places photos taken by turning on the spot, with next to no points.
     """
-    if model.num_reg_images() < min(SMALLEST_MODEL, total):
+    if model.num_reg_images() < SMALLEST_MODEL:
         return False
     seen = [image.num_points3D for image in model.images.values() if image.has_pose]
     if np.median(seen) < FEWEST_POINTS:

@@ -17,6 +17,7 @@ from pipeline.io.masks import read_keep_mask
 from pipeline.sfm.database import Progress, build_database, pair_count
 from pipeline.sfm.mapping import map_images
 from pipeline.sfm.model import (
+    SMALLEST_MODEL,
     implausible,
     largest,
     points_of,
@@ -94,11 +95,11 @@ def reconstruct(
     images are missing (`ladder`). `work_dir` is scratch and need not exist. `threads` serve
     features and matches; the result does not depend on them. UserError, naming images: unreadable
     images, masks missing or of a wrong size, no features, no matches, no model, an impossible
-    model, fewer than the share `min_registered` placed.
+    model, fewer than three photos or the share `min_registered` placed.
     """
     names = sorted(names)
-    if len(names) < 2:
-        raise UserError(f"{len(names)} photo in {image_dir}: poses need two or more.")
+    if len(names) < SMALLEST_MODEL:
+        raise UserError(f"{len(names)} photos in {image_dir}: poses need three or more.")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     work_dir.mkdir(parents=True, exist_ok=True)
@@ -123,7 +124,7 @@ def reconstruct(
         models = map_images(
             database, image_dir, work_dir, len(names), attempt, seed=seed, progress=report
         )
-        models = [model for model in models if usable(model, len(names))]
+        models = [model for model in models if usable(model)]
         moved = [model for model in models if not turns_alone(model, database)]
         tries.append(_Try(label, attempt, moved, matching, len(moved) < len(models)))
         log.info("attempt (%s): %d of %d photos placed", label, tries[-1].registered, len(names))
