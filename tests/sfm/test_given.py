@@ -100,6 +100,13 @@ def test_given_poses_stay_and_points_tell_the_depths(scene, tmp_path):
     for name, view in found.views.items():
         assert np.array_equal(view.cam_from_world, views[name].cam_from_world)
         assert view.intrinsics == views[name].intrinsics
+    # What is written as `sparse/`, where points are found for it: the same cameras.
+    for image in found.model.images.values():
+        pose = views[image.name].cam_from_world
+        assert np.allclose(image.cam_from_world().matrix(), pose[:3], rtol=0, atol=1e-12)
+        assert list(image.camera.params) == [*views[image.name].intrinsics, 0, 0, 0]
+    assert sorted(image.name for image in found.model.images.values()) == scene.names
+    for view in found.views.values():
         assert 2.9 * 0.6 < view.near < 2.9 and 5.0 < view.far < 5.0 * 1.6
     assert found.reprojection_px < 0.5 and len(found.points_xyz) > 100
     # The planes stand at 5, 3.6 and 2.9 metres along the world's z.
