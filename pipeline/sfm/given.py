@@ -154,7 +154,7 @@ def triangulate(
     model = _with_points(_posed_model(database, given), database, image_dir, work_dir, seed)
     report("triangulating", 1, 1)
     _check_fit(model, sum(matching.matched[name] for name in given), image_dir)
-    views = {name: with_depths(view, model, depth_margin) for name, view in sorted(given.items())}
+    views = with_depths(given, model, depth_margin)
     _check_depths(views)
     _check_origin(views)
     xyz, rgb, error = points_of(model)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib  # noqa: F401  before pycolmap, see the package
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,14 +100,20 @@ def _depth_range(
     return None
 
 
-def with_depths(view: View, model: pycolmap.Reconstruction, margin: float) -> View:
-    """`view` with the depths of the points that its image sees, where it does not know them itself."""
-    if 0 < view.near < view.far:
-        return view
+def with_depths(
+    views: Mapping[str, View], model: pycolmap.Reconstruction, margin: float
+) -> dict[str, View]:
+    """The views, sorted by name, with depths of the points that their images see where they know none."""
     everything = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    image = model.find_image_with_name(view.name)
-    bounds = _depth_range(model, image, view.cam_from_world, everything, margin) if image else None
-    return view if bounds is None else replace(view, near=bounds[0], far=bounds[1])
+    images = {image.name: image for image in model.images.values()}
+    found = dict(sorted(views.items()))
+    for name, view in found.items():
+        if 0 < view.near < view.far or name not in images:
+            continue
+        bounds = _depth_range(model, images[name], view.cam_from_world, everything, margin)
+        if bounds is not None:
+            found[name] = replace(view, near=bounds[0], far=bounds[1])
+    return found
 
 
 def implausible(views: dict[str, View]) -> str | None:
