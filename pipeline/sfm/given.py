@@ -144,12 +144,7 @@ def triangulate(
         database, image_dir, mask_dir, sizes, {}, settings,
         seed=seed, threads=threads, progress=report, pairs=near,
     )  # fmt: skip
-    lost = [_unposed(name, matching) for name in names if name not in given]
-    tell_lost(lost)
-    refuse_few(
-        len(given), lost, min_registered, image_dir,
-        "Find poses for the others too, set poses.use_given: false, or lower poses.min_registered.",
-    )  # fmt: skip
+    lost = _lost(names, given, matching, min_registered, image_dir)
     report("triangulating", 0, 1)
     model = _with_points(_posed_model(database, given), database, image_dir, work_dir, seed)
     report("triangulating", 1, 1)
@@ -225,6 +220,23 @@ def _with_points(
         posed, database, image_dir, out,
         clear_points=True, options=options, refine_intrinsics=False,
     )  # fmt: skip
+
+
+def _lost(
+    names: Sequence[str],
+    given: Mapping[str, View],
+    matching: Matching,
+    share: float,
+    image_dir: Path,
+) -> list[LostImage]:
+    """The images without a pose, told; UserError when less than `share` of all has one."""
+    lost = [_unposed(name, matching) for name in names if name not in given]
+    tell_lost(lost)
+    hint = (
+        "Find poses for the others too, set poses.use_given: false, or lower poses.min_registered."
+    )
+    refuse_few(len(given), lost, share, image_dir, hint)
+    return lost
 
 
 def _unposed(name: str, matching: Matching) -> LostImage:

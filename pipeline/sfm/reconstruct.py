@@ -124,9 +124,7 @@ def reconstruct(
         models = map_images(
             database, image_dir, work_dir, len(names), attempt, seed=seed, progress=report
         )
-        models = [model for model in models if usable(model)]
-        moved = [model for model in models if not turns_alone(model, database)]
-        tries.append(_Try(label, attempt, moved, matching, len(moved) < len(models)))
+        tries.append(_weighed(_Try(label, attempt, models, matching), database))
         log.info("attempt (%s): %d of %d photos placed", label, tries[-1].registered, len(names))
         if best is None or tries[-1].beats(best):
             best = tries[-1]
@@ -138,6 +136,13 @@ def reconstruct(
 
 def silent(phase: str, done: int, total: int) -> None:
     """Nothing: the progress of work that nobody watches."""
+
+
+def _weighed(one: _Try, database: Path) -> _Try:
+    """The attempt without the models that say nothing."""
+    models = [model for model in one.models if usable(model)]
+    moved = [model for model in models if not turns_alone(model, database)]
+    return replace(one, models=moved, turned=len(moved) < len(models))
 
 
 def worth_matching(attempt: Settings, lost: int, total: int) -> bool:
