@@ -36,7 +36,7 @@ class Params(Section):
     """Section `ingest`."""
 
     max_size: Annotated[int, Field(ge=0, description="longest side in pixels; 0 keeps the size")]
-    min_images: Annotated[int, Field(ge=2)]
+    min_images: Annotated[int, Field(ge=3)]  # of two no solver tells the places
     holdout: Annotated[
         int, Field(ge=0, description="every n-th image is held out; 0 holds out none")
     ]

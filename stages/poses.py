@@ -14,7 +14,7 @@ from pipeline import sfm
 from pipeline.errors import UserError
 from pipeline.field.growing import aligned_poses
 from pipeline.io.atomic import publish_dir, write_json
-from pipeline.io.posed import read_posed_images
+from pipeline.io.posed import read_posed_images, refuse_too_large
 from pipeline.io.scene import GIVEN_POSES, ImageRecord, read_images_json, read_origin
 from pipeline.io.transforms import read_transforms, write_transforms
 from pipeline.parallel import cores, map_named
@@ -74,20 +74,22 @@ def _found(job: Job, params: Params, records: Sequence[ImageRecord]) -> sfm.Reco
     """Poses and points from the photos, or the poses that came with them and points for these."""
     paths, names = job.paths, [record.name for record in records]
     masks, given = paths.masks if params.use_masks else None, paths.images / GIVEN_POSES
+    keeps = params.use_given and given.is_file()
+    if masks and params.align_rounds and not keeps:
+        refuse_too_large(records)  # now, not after hours of matching
     with tqdm(total=len(names), desc="features", unit="photo", leave=False) as bar:
         common: dict[str, Any] = {
             "work_dir": paths.work("poses"),
             "settings": _settings(params, read_origin(paths.images).kind, len(records)),
             "progress": partial(_show, bar),
             "threads": cores(),
-            **params.model_dump(include={"depth_margin", "seed"}),
+            **params.model_dump(include={"depth_margin", "min_registered", "seed"}),
         }
-        if params.use_given and given.is_file():
+        if keeps:
             log.info("the poses that came with the photos are kept; points are found for them")
             return sfm.triangulate(paths.images, masks, names, read_transforms(given), **common)
-        common |= params.model_dump(include={"min_registered", "retry"})
         common["focal_px"] = {record.name: record.focal_px for record in records if record.focal_px}
-        found = sfm.reconstruct(paths.images, masks, names, **common)
+        found = sfm.reconstruct(paths.images, masks, names, retry=params.retry, **common)
     if masks is None or not params.align_rounds:
         return found
     images = read_posed_images(paths.images, masks, found.views)

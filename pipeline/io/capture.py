@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import filecmp
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,13 +21,15 @@ from pipeline.io.llff import read_poses_bounds
 from pipeline.io.photos import VIDEO_SUFFIXES, by_image_name, list_photos
 from pipeline.io.scene import image_name
 
+log = logging.getLogger(__name__)
+
 TRANSFORMS = "transforms.json"
 POSES_BOUNDS = "poses_bounds.npy"
 RAIN_MASK = "rainMask.npy"
 MASKS = "masks"
 TRUTH = "truth"
 CLUTTER = frozenset({"Thumbs.db", "desktop.ini"})  # of file managers; hidden files are too
-COLMAP_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+COLMAP_PLACES = ("sparse/*", "sparse", "colmap/sparse/*", ".")  # *: models are numbered
 ColmapReader = Callable[[Path, Sequence[Path]], list[GivenView]]
 
 
@@ -77,7 +80,8 @@ def find_capture(folder: Path, at_least: int, read_colmap: ColmapReader) -> Capt
         if (folder / POSES_BOUNDS).is_file():
             views, posed_by = read_poses_bounds(folder / POSES_BOUNDS, _files(photos)), "LLFF"
         elif model is not None:
-            views, posed_by = read_colmap(model, _files(photos)), "COLMAP"
+            model, views = _fullest_model(folder, _files(photos), read_colmap)
+            posed_by = "COLMAP"
     masks, rain_mask = _masks(folder, photos, views), folder / RAIN_MASK
     return Capture(
         photos=dict(sorted(photos.items())),
@@ -123,12 +127,50 @@ def _enough(folder: Path, photos: dict[str, Path], at_least: int) -> None:
 
 def find_model(folder: Path) -> Path | None:
     """The folder of a COLMAP model (text or binary) at one of its usual places under `folder`."""
+    return next(iter(_models(folder)), None)
+
+
+def _models(folder: Path) -> list[Path]:
+    """All models at the first of the usual places that has any, by number."""
     for place in COLMAP_PLACES:
-        for suffix in (".bin", ".txt"):
-            parts = [folder / place / (part + suffix) for part in ("cameras", "images", "points3D")]
-            if all(part.is_file() for part in parts):
-                return folder / place
-    return None
+        found = [folder / place]
+        if place.endswith("*"):
+            numbered = [path for path in (folder / place).parent.glob("*") if path.name.isdecimal()]
+            found = sorted(numbered, key=lambda path: (int(path.name), path.name))
+        if models := [path for path in found if _is_model(path)]:
+            return models
+    return []
+
+
+def _is_model(folder: Path) -> bool:
+    parts = ("cameras", "images", "points3D")
+    return any(
+        all((folder / (part + suffix)).is_file() for part in parts) for suffix in (".bin", ".txt")
+    )
+
+
+def _fullest_model(
+    folder: Path, photos: Sequence[Path], read_colmap: ColmapReader
+) -> tuple[Path, list[GivenView]]:
+    """Of the models of photos that did not come together the one that places most, and its cameras."""
+    models = _models(folder)
+    if len(models) == 1:
+        return models[0], read_colmap(models[0], photos)
+    read: dict[Path, list[GivenView]] = {}
+    faults = []
+    for model in models:
+        try:
+            read[model] = read_colmap(model, photos)
+        except UserError as fault:
+            faults.append(fault)
+    if not read:
+        raise faults[0]
+    fullest = max(read, key=lambda model: len(read[model]))
+    log.warning(
+        "%s holds %d models; %s is taken, which places most photos: %d of %d",
+        fullest.parent, len(models), fullest.name, len(read[fullest]), len(photos),
+    )  # fmt: skip
+    return fullest, read[fullest]
 
 
 def _photo_folder(folder: Path) -> Path:

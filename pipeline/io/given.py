@@ -18,7 +18,7 @@ from pipeline.io.atomic import read_json
 from pipeline.io.transforms import GL_FROM_CV, View
 
 SAME_SHAPE = 0.01  # how far the ratios of width to height of a photo and its camera may differ
-RIGID = 1e-4  # how far R R^T may be from the identity
+RIGID = 2e-4  # how far R R^T may be from the identity: as far as four decimals leave it
 MOST_BENT = 0.25  # |k1| r^2 in the corner up to which rays through one radial term are exact
 COVERED = 0.95  # a straightened picture that is filled less shows a lens model folding back
 GLANCE_PX = 160  # longest side of the picture on which that is tried
@@ -157,12 +157,27 @@ def _matrix(view: GivenView, size: tuple[int, int]) -> np.ndarray:
 
 
 def checked_rigid(pose: np.ndarray, whose: str) -> np.ndarray:
-    """`pose` (4, 4) itself; UserError naming `whose` it is when it is no rotation and translation."""
+    """`pose` (4, 4) with the rotation nearest to its own, which its file has rounded.
+
+    Its transpose is then its inverse; the translation stays, of a camera-to-world pose the place. UserError
+    naming `whose` it is when it is no rotation and translation.
+    """
     rotation = pose[:3, :3]
     rigid = np.isfinite(pose).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID)
     if not rigid or np.linalg.det(rotation) < 0:
         raise UserError(f"{whose} is not a rotation and a translation.", "Export the poses again.")
-    return pose
+    left, _, right = np.linalg.svd(rotation)
+    exact = np.eye(4)
+    exact[:3, :3], exact[:3, 3] = left @ right, pose[:3, 3]
+    return exact
+
+
+def inverse_rigid(pose: np.ndarray) -> np.ndarray:
+    """The inverse (4, 4) of a rotation and a translation: cam_from_world of a world_from_cam."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
 
 
 def checked_camera(view: GivenView, whose: str) -> GivenView:
@@ -213,11 +228,11 @@ def _nerfstudio_view(path: Path, content: dict[str, Any], frame: dict[str, Any])
     fisheye = model == "OPENCV_FISHEYE" or bool(both.get("is_fisheye"))  # the latter: instant-ngp's
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     world_from_gl = np.asarray(frame["transform_matrix"], np.float64).reshape(4, 4)
-    checked_rigid(world_from_gl, f"{path}: the pose of {photo.name}")
+    world_from_gl = checked_rigid(world_from_gl, f"{path}: the pose of {photo.name}")
     mask = frame.get("mask_path")
     view = GivenView(
         photo=photo,
-        cam_from_world=np.linalg.inv(world_from_gl @ GL_FROM_CV),
+        cam_from_world=inverse_rigid(world_from_gl @ GL_FROM_CV),
         width=width,
         height=height,
         fx=focal,

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import read_npy
-from pipeline.io.given import GivenView, checked_camera, checked_rigid
+from pipeline.io.given import GivenView, checked_camera, checked_rigid, inverse_rigid
 from pipeline.io.transforms import View
 
 
@@ -55,10 +55,10 @@ def read_poses_bounds(path: Path, photos: Sequence[Path]) -> list[GivenView]:
         down, right, back, place, (height, width, focal) = matrix.T
         world_from_cam = np.eye(4)
         world_from_cam[:3] = np.stack([right, down, -back, place], axis=1)
-        checked_rigid(world_from_cam, f"{path}: the pose of {photo.name}")
+        world_from_cam = checked_rigid(world_from_cam, f"{path}: the pose of {photo.name}")
         view = GivenView(
             photo=photo,
-            cam_from_world=np.linalg.inv(world_from_cam),
+            cam_from_world=inverse_rigid(world_from_cam),
             width=_pixels(width),
             height=_pixels(height),
             fx=focal,

@@ -41,7 +41,7 @@ def read_posed_images(
     per pixel.
     """
     records = posed_records(images, views)
-    _refuse_too_large(records, held_bytes)
+    refuse_too_large(records, held_bytes)
     found = []
     for record in records:
         view = views[record.name]
@@ -84,8 +84,11 @@ def posed_records(
     return records
 
 
-def _refuse_too_large(records: Sequence[ImageRecord], held_bytes: int) -> None:
-    """Told by their listed sizes, before any is read: else the system would end the fit without a word."""
+def refuse_too_large(records: Sequence[ImageRecord], held_bytes: int = HELD_BYTES) -> None:
+    """UserError when the free memory cannot hold what a fit of these images holds.
+
+    Told by their listed sizes, before any is read: else the system would end the fit without a word.
+    """
     pixels = sum(record.width * record.height for record in records)
     needed, free = held_bytes * pixels, free_memory()
     if pixels <= MOST_PIXELS and needed <= free:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pycolmap
 
 from pipeline.errors import UserError
-from pipeline.sfm.result import Matching, Settings
+from pipeline.sfm.result import Matcher, Matching, Settings
 
 Progress = Callable[[str, int, int], None]
 SEQUENCE_OVERLAP = 10
@@ -26,8 +26,11 @@ def build_database(
     seed: int,
     threads: int,
     progress: Progress,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> Matching:
     """Writes a new database with cameras, features and verified matches; returns their counts.
+
+    `pairs` are the images that are matched, by name; without them `settings.matcher` chooses.
 
     Images are entered in name order before any feature is computed, RANSAC is seeded, and features are
     matched on one thread, so that the content does not depend on `threads`. UserError when an image
@@ -42,7 +45,7 @@ def build_database(
     _enter_images(path, image_dir, sizes, settings, reader)
     _set_focal_lengths(path, sizes, focal_px)
     _extract(path, image_dir, sorted(sizes), settings, reader, threads, progress)
-    _match(path, settings, seed, progress)
+    _match(path, settings, seed, progress, pairs)
     return read_matching(path)
 
 
@@ -117,14 +120,35 @@ def _extract(
     progress("features", len(names), len(names))
 
 
-def _match(path: Path, settings: Settings, seed: int, progress: Progress) -> None:
+def pair_count(matcher: Matcher, total: int) -> int:
+    """How many pairs of `total` images are matched, about."""
+    return total * SEQUENCE_OVERLAP if matcher == "sequential" else total * (total - 1) // 2
+
+
+def _match(
+    path: Path,
+    settings: Settings,
+    seed: int,
+    progress: Progress,
+    pairs: Sequence[tuple[str, str]] | None,
+) -> None:
     # On one thread: two of pycolmap 4.2's matchers at once find other matches in some of ten runs.
     options = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
     options.sift.max_ratio = settings.max_ratio
     verification = pycolmap.TwoViewGeometryOptions(filter_stationary_matches=settings.still)
     verification.ransac.random_seed = seed
     progress("matching", 0, 1)
-    if settings.matcher == "exhaustive":
+    if pairs is not None:
+        listed = path.with_name("pairs.txt")
+        listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), "utf-8")
+        pycolmap.match_image_pairs(
+            path,
+            matching_options=options,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    elif settings.matcher == "exhaustive":
         pycolmap.match_exhaustive(
             path,
             matching_options=options,

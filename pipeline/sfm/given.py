@@ -19,8 +19,9 @@ from pipeline.io.given import GivenView, checked_camera
 from pipeline.io.transforms import View
 from pipeline.sfm.database import Progress, build_database
 from pipeline.sfm.model import points_of, with_depths
-from pipeline.sfm.reconstruct import check_inputs, silent
+from pipeline.sfm.reconstruct import check_inputs, refuse_few, silent, tell_lost
 from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
+from pipeline.sfm.whole import refuse_cut_short
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ _MODELS: dict[str, tuple[int, tuple[str, ...], bool]] = {
 # Shares of matched features that become points. Measured: 0.77 and 0.83 with right poses, 0.12 and 0.06
 # with each photo's pose given to its neighbour or to the fifth from it.
 MISFIT, DOUBTFUL = 0.2, 0.5
+MANY_VIEWS, NEIGHBOURS = 60, 20  # of more views than that, each is matched with its nearest
 MOST_OFF_PX = 1.0  # that rounding to 32 bits may move what the cameras see
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _ORDER_FISHEYE = ("k1", "k2", "k3", "k4")
@@ -52,6 +54,7 @@ def read_colmap(folder: Path, photos: Sequence[Path]) -> list[GivenView]:
     expressed, or a model of other photos.
     """
     try:
+        refuse_cut_short(folder)
         model = pycolmap.Reconstruction(str(folder))
     except (ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
         raise UserError(f"{folder} is not a readable COLMAP model ({error}).") from None
@@ -86,9 +89,16 @@ def _given(folder: Path, photo: Path, image: pycolmap.Image) -> GivenView:
     params = [float(value) for value in camera.params]
     bent = dict(zip(names, params[focals + 2 :], strict=True))
     order = _ORDER_FISHEYE if fisheye else _ORDER
+    try:
+        pose = as_4x4(image.cam_from_world().matrix())
+    except (RuntimeError, ValueError):  # the rig has a pose, its camera none on it
+        raise UserError(
+            f"{folder} does not tell where on its rig the camera of {photo.name} is.",
+            "Calibrate the rig first, or take that camera's photos away.",
+        ) from None
     view = GivenView(
         photo=photo,
-        cam_from_world=as_4x4(image.cam_from_world().matrix()),
+        cam_from_world=pose,
         width=int(camera.width),
         height=int(camera.height),
         fx=params[0],
@@ -109,6 +119,7 @@ def triangulate(
     *,
     work_dir: Path,
     settings: Settings,
+    min_registered: float = 0.0,
     depth_margin: float = 0.2,
     seed: int = 0,
     threads: int = 1,
@@ -118,7 +129,8 @@ def triangulate(
 
     The points tell the depths where the views do not, and their error tells whether the poses are
     those of the photos. Images without a given pose are lost. Other arguments as in `reconstruct`.
-    UserError when masks are missing, the poses do not fit, or depths stay unknown.
+    UserError when masks are missing, fewer than the share `min_registered` have a pose, the poses do not
+    fit, or depths stay unknown.
     """
     names, settings = sorted(names), replace(settings, camera="per_image")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
@@ -127,22 +139,24 @@ def triangulate(
     work_dir.mkdir(parents=True, exist_ok=True)
     report = progress if progress is not None else silent
     database = work_dir / "database.db"
+    near = nearest_pairs(given) if settings.matcher == "exhaustive" else None
     matching = build_database(
         database, image_dir, mask_dir, sizes, {}, settings,
-        seed=seed, threads=threads, progress=report,
+        seed=seed, threads=threads, progress=report, pairs=near,
     )  # fmt: skip
+    lost = _lost(names, given, matching, min_registered, image_dir)
     report("triangulating", 0, 1)
     model = _with_points(_posed_model(database, given), database, image_dir, work_dir, seed)
     report("triangulating", 1, 1)
     _check_fit(model, sum(matching.matched[name] for name in given), image_dir)
-    views = {name: with_depths(view, model, depth_margin) for name, view in sorted(given.items())}
+    views = with_depths(given, model, depth_margin)
     _check_depths(views)
     _check_origin(views)
     xyz, rgb, error = points_of(model)
     reprojection = model.compute_mean_reprojection_error() if len(xyz) else 0.0
     return Reconstructed(
         views=views,
-        lost=[_unposed(name, matching) for name in names if name not in given],
+        lost=lost,
         points_xyz=xyz,
         points_rgb=rgb,
         points_error=error,
@@ -170,6 +184,29 @@ def _of_these(
     return found
 
 
+def nearest_pairs(given: Mapping[str, View]) -> list[tuple[str, str]] | None:
+    """Which of many views are matched, by name: each with its NEIGHBOURS nearest; None for all, of few.
+
+    A turn by a radian is as far as the views' mean distance from their midst.
+    """
+    names = sorted(given)
+    if len(names) <= MANY_VIEWS or any(
+        name.startswith("#") for name in names
+    ):  # a remark in a list
+        return None
+    centres = np.stack([centre(given[name].cam_from_world) for name in names])
+    ahead = np.stack([given[name].cam_from_world[2, :3] for name in names])
+    extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    pairs = set()
+    for index, name in enumerate(names):
+        away = np.linalg.norm(centres - centres[index], axis=1) / max(extent, 1e-12)
+        away += np.arccos(np.clip(ahead @ ahead[index], -1.0, 1.0))
+        away[index] = np.inf
+        nearest = np.argsort(away, kind="stable")[:NEIGHBOURS]
+        pairs |= {(min(name, names[other]), max(name, names[other])) for other in nearest}
+    return sorted(pairs)
+
+
 def _with_points(
     posed: pycolmap.Reconstruction, database: Path, image_dir: Path, work_dir: Path, seed: int
 ) -> pycolmap.Reconstruction:
@@ -183,6 +220,23 @@ def _with_points(
         posed, database, image_dir, out,
         clear_points=True, options=options, refine_intrinsics=False,
     )  # fmt: skip
+
+
+def _lost(
+    names: Sequence[str],
+    given: Mapping[str, View],
+    matching: Matching,
+    share: float,
+    image_dir: Path,
+) -> list[LostImage]:
+    """The images without a pose, told; UserError when less than `share` of all has one."""
+    lost = [_unposed(name, matching) for name in names if name not in given]
+    tell_lost(lost)
+    hint = (
+        "Find poses for the others too, set poses.use_given: false, or lower poses.min_registered."
+    )
+    refuse_few(len(given), lost, share, image_dir, hint)
+    return lost
 
 
 def _unposed(name: str, matching: Matching) -> LostImage:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib  # noqa: F401  before pycolmap, see the package
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,8 @@ from pipeline.io.transforms import View
 WIDEST_DEG = 170.0
 NARROWEST_DEG = 2.0
 MOST_BENT = 0.6  # |k1| r^2 in the corner; the widest lenses of action cameras reach about 0.4
-SMALLEST_MODEL = 3
+SMALLEST_MODEL = 3  # pycolmap's mappers place two photos nowhere
+FEWEST_POINTS = 15  # seen by an image, at the median; placing one takes as many
 DEPTH_PERCENTILES = (1.0, 99.0)
 SURE_VIEWS = 3  # a wrong match of two photos makes a point at any depth; a third photo rules it out
 
@@ -27,12 +28,16 @@ def largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstructio
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
-def usable(model: pycolmap.Reconstruction, total: int) -> bool:
-    """Whether a model of some of `total` images says anything: enough of them, through a possible lens.
+def usable(model: pycolmap.Reconstruction) -> bool:
+    """Whether a model says anything: enough images and of what they see, through a possible lens.
 
-    A few photos of drops on the lens agree on scenes that no lens shows: two photos, k1 in the tens.
+    A few photos of drops on the lens agree on scenes that no lens shows: two photos, k1 in the tens. The
+    global mapper places photos taken by turning on the spot, with next to no points.
     """
-    if model.num_reg_images() < min(SMALLEST_MODEL, total):
+    if model.num_reg_images() < SMALLEST_MODEL:
+        return False
+    seen = [image.num_points3D for image in model.images.values() if image.has_pose]
+    if np.median(seen) < FEWEST_POINTS:
         return False
     for camera in model.cameras.values():
         focal, cx, cy, k1 = camera.params
@@ -95,14 +100,20 @@ def _depth_range(
     return None
 
 
-def with_depths(view: View, model: pycolmap.Reconstruction, margin: float) -> View:
-    """`view` with the depths of the points that its image sees, where it does not know them itself."""
-    if 0 < view.near < view.far:
-        return view
+def with_depths(
+    views: Mapping[str, View], model: pycolmap.Reconstruction, margin: float
+) -> dict[str, View]:
+    """The views, sorted by name, with depths of the points that their images see where they know none."""
     everything = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    image = model.find_image_with_name(view.name)
-    bounds = _depth_range(model, image, view.cam_from_world, everything, margin) if image else None
-    return view if bounds is None else replace(view, near=bounds[0], far=bounds[1])
+    images = {image.name: image for image in model.images.values()}
+    found = dict(sorted(views.items()))
+    for name, view in found.items():
+        if 0 < view.near < view.far or name not in images:
+            continue
+        bounds = _depth_range(model, images[name], view.cam_from_world, everything, margin)
+        if bounds is not None:
+            found[name] = replace(view, near=bounds[0], far=bounds[1])
+    return found
 
 
 def implausible(views: dict[str, View]) -> str | None:

@@ -14,9 +14,10 @@ import pycolmap
 from pipeline.errors import UserError
 from pipeline.io.images import image_size, read_image
 from pipeline.io.masks import read_keep_mask
-from pipeline.sfm.database import Progress, build_database
+from pipeline.sfm.database import Progress, build_database, pair_count
 from pipeline.sfm.mapping import map_images
 from pipeline.sfm.model import (
+    SMALLEST_MODEL,
     implausible,
     largest,
     points_of,
@@ -24,7 +25,15 @@ from pipeline.sfm.model import (
     usable,
     views_of,
 )  # fmt: skip
-from pipeline.sfm.result import Attempt, LostImage, Matching, Reconstructed, Settings
+from pipeline.sfm.result import (
+    LONG_VIDEO,
+    Attempt,
+    LostImage,
+    Matching,
+    Reconstructed,
+    Settings,
+)
+from pipeline.sfm.turning import turns_alone
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +42,8 @@ FEWEST_FEATURES = 50
 # A later attempt that places more images wins, unless its error says that it placed them wrongly.
 WORSE_ERROR = 1.5
 FINE_ERROR_PX = 1.0
+# A pair takes 0.36 s of a slow core with twice the features: 2,000 are 12 minutes, all of 500 photos 12 hours.
+MANY_PAIRS, FEW_LOST = 2000, 0.05
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,7 @@ class _Try:
     settings: Settings
     models: list[pycolmap.Reconstruction]
     matching: Matching
+    turned: bool = False  # whether a model was left out because turning on the spot explains it
 
     @property
     def best(self) -> pycolmap.Reconstruction | None:
@@ -83,11 +95,11 @@ def reconstruct(
     images are missing (`ladder`). `work_dir` is scratch and need not exist. `threads` serve
     features and matches; the result does not depend on them. UserError, naming images: unreadable
     images, masks missing or of a wrong size, no features, no matches, no model, an impossible
-    model, fewer than the share `min_registered` placed.
+    model, fewer than three photos or the share `min_registered` placed.
     """
     names = sorted(names)
-    if len(names) < 2:
-        raise UserError(f"{len(names)} photo in {image_dir}: poses need two or more.")
+    if len(names) < SMALLEST_MODEL:
+        raise UserError(f"{len(names)} photos in {image_dir}: poses need three or more.")
     sizes = check_inputs(image_dir, mask_dir if settings.masked else None, names)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     work_dir.mkdir(parents=True, exist_ok=True)
@@ -95,10 +107,15 @@ def reconstruct(
     tries: list[_Try] = []
     best: _Try | None = None
     database = work_dir / "database.db"
-    rungs = ladder(settings, mask_dir is not None)
+    rungs = ladder(settings, mask_dir is not None, len(names))
     for label, attempt in rungs if retry else itertools.islice(rungs, 1):
         if tries and attempt.features_key() == tries[-1].settings.features_key():
             matching = tries[-1].matching
+        elif best is not None and not worth_matching(
+            attempt, len(names) - best.registered, len(names)
+        ):
+            _tell_given_up(best, names)
+            break
         else:
             matching = build_database(
                 database, image_dir, mask_dir, sizes, focal_px or {}, attempt,
@@ -107,8 +124,7 @@ def reconstruct(
         models = map_images(
             database, image_dir, work_dir, len(names), attempt, seed=seed, progress=report
         )
-        models = [model for model in models if usable(model, len(names))]
-        tries.append(_Try(label, attempt, models, matching))
+        tries.append(_weighed(_Try(label, attempt, models, matching), database))
         log.info("attempt (%s): %d of %d photos placed", label, tries[-1].registered, len(names))
         if best is None or tries[-1].beats(best):
             best = tries[-1]
@@ -122,8 +138,31 @@ def silent(phase: str, done: int, total: int) -> None:
     """Nothing: the progress of work that nobody watches."""
 
 
-def ladder(settings: Settings, masks_exist: bool) -> Iterator[tuple[str, Settings]]:
-    """The attempts in order, from what was asked for to what is left to try, each with its name."""
+def _weighed(one: _Try, database: Path) -> _Try:
+    """The attempt without the models that say nothing."""
+    models = [model for model in one.models if usable(model)]
+    moved = [model for model in models if not turns_alone(model, database)]
+    return replace(one, models=moved, turned=len(moved) < len(models))
+
+
+def worth_matching(attempt: Settings, lost: int, total: int) -> bool:
+    """Whether photos are matched anew for `lost` ones of `total`: for few of many that takes too long."""
+    return lost >= FEW_LOST * total or pair_count(attempt.matcher, total) <= MANY_PAIRS
+
+
+def _tell_given_up(best: _Try, names: Sequence[str]) -> None:
+    placed = registered_names(best.best) if best.best is not None else []
+    log.warning(
+        "no further attempt is made to place %s: matching all photos again would take long",
+        ", ".join(name for name in names if name not in set(placed)),
+    )
+
+
+def ladder(settings: Settings, masks_exist: bool, total: int = 0) -> Iterator[tuple[str, Settings]]:
+    """The attempts in order, from what was asked for to what is left to try, each with its name.
+
+    Of `total` photos: of many every pair is matched only where that was asked for.
+    """
     yield "first", settings
     loose = replace(settings, loose=True)
     yield "placing on fewer matches", loose
@@ -132,7 +171,7 @@ def ladder(settings: Settings, masks_exist: bool) -> Iterator[tuple[str, Setting
         max_features=2 * settings.max_features,
         peak_threshold=settings.peak_threshold / 2,
         max_ratio=0.85,
-        matcher="exhaustive",
+        matcher=settings.matcher if total > LONG_VIDEO else "exhaustive",
     )
     yield "more and fainter features", more
     other = "incremental" if settings.mapper == "global" else "global"
@@ -183,8 +222,7 @@ def _result(
     image_dir: Path,
 ) -> Reconstructed:
     lost = _lost_images(best, names)
-    for image in lost:
-        log.warning("no pose for %s", image)
+    tell_lost(lost)
     if best.best is None:
         raise UserError(*_no_model(best.matching, tries, image_dir))
     views = views_of(best.best, depth_margin)
@@ -194,13 +232,10 @@ def _result(
             f"the poses found for {image_dir} cannot be right: {fault}.",
             "Photos from different places are needed, with more overlap.",
         )
-    if len(views) < min_registered * len(names):
-        raise UserError(
-            f"only {len(views)} of {len(names)} photos in {image_dir} could be placed "
-            f"({len(views) / len(names):.0%}, poses.min_registered is {min_registered:.0%}). "
-            f"Lost: {', '.join(map(str, lost))}.",
-            "Take photos with more overlap, or lower poses.min_registered.",
-        )
+    refuse_few(
+        len(views), lost, min_registered, image_dir,
+        "Take photos with more overlap, or lower poses.min_registered.",
+    )  # fmt: skip
     xyz, rgb, error = points_of(best.best)
     return Reconstructed(
         views=views,
@@ -224,6 +259,26 @@ def _result(
         settings=best.settings,
         model=best.best,
     )
+
+
+def tell_lost(lost: Sequence[LostImage]) -> None:
+    """Warns of each lost image."""
+    for image in lost:
+        log.warning("no pose for %s", image)
+
+
+def refuse_few(
+    placed: int, lost: Sequence[LostImage], share: float, image_dir: Path, hint: str
+) -> None:
+    """UserError, with `hint`, when less than `share` of all images is placed."""
+    total = placed + len(lost)
+    if placed < share * total:
+        raise UserError(
+            f"only {placed} of {total} photos in {image_dir} could be placed "
+            f"({placed / total:.0%}, poses.min_registered is {share:.0%}). "
+            f"Lost: {', '.join(map(str, lost))}.",
+            hint,
+        )
 
 
 def _model_sizes(one: _Try) -> list[int]:
@@ -257,6 +312,12 @@ def _lost_images(best: _Try, names: Sequence[str]) -> list[LostImage]:
 def _no_model(matching: Matching, tries: Sequence[_Try], image_dir: Path) -> tuple[str, str]:
     """What to say when no attempt gave a model."""
     tried = f"Tried: {', '.join(one.label for one in tries)}."
+    if any(one.turned for one in tries):
+        return (
+            f"the poses found for {image_dir} cannot be right: turning on the spot explains all matches. "
+            f"{tried}",
+            "Photos from different places are needed, with more overlap.",
+        )
     if max(matching.keypoints.values()) < FEWEST_FEATURES:
         most = max(matching.keypoints, key=lambda name: matching.keypoints[name])
         return (

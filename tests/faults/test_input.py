@@ -153,6 +153,7 @@ def test_an_unknown_parameter_names_the_nearest(photos: Workshop) -> None:
     [
         ("ingest", "max_size", -1),
         ("ingest", "min_images", "many"),
+        ("ingest", "min_images", 2),
         ("attention", "steps", 0),
         ("masks", "threshold", 1.5),
         ("masks", "threshold", float("nan")),

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import UserError
+from pipeline.geometry.poses import centre, nearest_rotation
 from pipeline.io.capture import Capture, adopt, find_capture, refuse_outside
 from pipeline.io.given import (
     GivenView,
@@ -138,6 +139,40 @@ def _write(folder: Path, content: dict[str, Any]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "transforms.json").write_text(json.dumps(content))
     return folder / "transforms.json"
+
+
+@pytest.mark.parametrize("form", ["nerfstudio", "LLFF"])
+def test_rotations_rounded_to_four_decimals_leave_the_places_where_they_are(
+    tmp_path: Path, form: str
+) -> None:
+    """780 units from the origin, 1e-4 of the rotation are 0.08 of the place, if R^T stands for its inverse."""
+    random = np.random.default_rng(1)
+    _photos(tmp_path / "images")
+    for _ in range(40):
+        content, rows, places = _transforms(tmp_path), [], []
+        for frame in content["frames"]:
+            matrix = np.eye(4)
+            matrix[:3, :3] = np.round(nearest_rotation(random.normal(size=(3, 3))), 4)
+            matrix[:3, 3] = np.array([612.3, -488.1, 35.2]) + random.normal(0, 3, 3)
+            frame["transform_matrix"] = matrix.tolist()
+            right, up, back, place = matrix[:3].T
+            shape = np.array([30.0, 40.0, 35.0])
+            row = np.stack([-up, right, back, place, shape], axis=1)
+            rows.append(np.concatenate([row.ravel(), [2.0, 9.0]]))
+            places.append(place)
+        if form == "nerfstudio":
+            views = read_nerfstudio(_write(tmp_path, content))
+        else:
+            np.save(tmp_path / "p.npy", np.stack(rows))
+            views = read_poses_bounds(
+                tmp_path / "p.npy", [tmp_path / "images" / name for name in NAMES]
+            )
+        for view, place, frame in zip(views, places, content["frames"], strict=True):
+            turn = view.cam_from_world[:3, :3]
+            assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-14)
+            assert np.allclose(centre(view.cam_from_world), place, rtol=0, atol=1e-9)
+            as_written = np.array(frame["transform_matrix"])[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+            assert np.allclose(turn.T, as_written, rtol=0, atol=2e-4)
 
 
 def test_nerfstudio_axes_and_intrinsics_are_read(tmp_path: Path) -> None:

@@ -234,22 +234,22 @@ def test_one_command_brings_a_folder_in(tmp_path: Path) -> None:
 
 def test_as_many_photos_are_asked_for_as_the_scene_needs(tmp_path: Path) -> None:
     """`ingest.min_images`, on the way in too: of the section, or of a scene that is there already."""
-    for name in "ab":
-        _photo(tmp_path / f"pair/{name}.jpg")
+    for name in "abc":
+        _photo(tmp_path / f"three/{name}.jpg")
     file = tmp_path / "params.yaml"
-    text = (ROOT / "params.yaml").read_text()
+    fewer = (ROOT / "params.yaml").read_text()
+    text = fewer.replace("min_images: 3 ", "min_images: 4 ")
     file.write_text(text)
-    with pytest.raises(UserError, match="at least 3"):
-        ingest._before(file, argparse.Namespace(source=tmp_path / "pair", scene="garden"))
+    with pytest.raises(UserError, match="at least 4"):
+        ingest._before(file, argparse.Namespace(source=tmp_path / "three", scene="garden"))
     assert file.read_text() == text and not (tmp_path / "data/garden").exists()
-    fewer = text.replace("min_images: 3 ", "min_images: 2 ")
     file.write_text(fewer)
-    ingest._before(file, argparse.Namespace(source=tmp_path / "pair", scene="garden"))
+    ingest._before(file, argparse.Namespace(source=tmp_path / "three", scene="garden"))
     assert (tmp_path / "data/garden/b.jpg").is_file()
     file.write_text(
-        text.replace("scenes:\n", "scenes:\n  shed: {<<: *scene, ingest: {min_images: 2}}\n")
+        text.replace("scenes:\n", "scenes:\n  shed: {<<: *scene, ingest: {min_images: 3}}\n")
     )
-    ingest._before(file, argparse.Namespace(source=tmp_path / "pair", scene="shed"))
+    ingest._before(file, argparse.Namespace(source=tmp_path / "three", scene="shed"))
     assert (tmp_path / "data/shed/b.jpg").is_file()
 
 

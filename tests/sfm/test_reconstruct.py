@@ -14,12 +14,14 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.geometry.poses import pose_errors
+from pipeline.geometry.trajectory import look_at
 from pipeline.io.images import read_image, write_image
 from pipeline.io.masks import write_keep_mask
 from pipeline.sfm import Settings, reconstruct, write_sparse
 from pipeline.sfm.mapping import map_images
 from pipeline.sfm.model import largest, usable, views_of
-from pipeline.sfm.reconstruct import ladder
+from pipeline.sfm.reconstruct import ladder, worth_matching
+from tests.planes import draw
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 SETTINGS = Settings(
@@ -183,6 +185,42 @@ def test_attempts_grow_looser_and_leave_masks_to_the_last():
     assert [r.mapper for r in rungs][-2] == "global"
 
 
+def test_attempts_at_long_videos_match_neighbours_alone():
+    """Every pair of 500 frames with twice the features: 15 hours of a processor."""
+    film = dataclasses.replace(MASKED, matcher="sequential")
+    for total, matcher in ((100, "exhaustive"), (101, "sequential")):
+        rungs = [settings for _, settings in ladder(film, masks_exist=True, total=total)]
+        assert [r.matcher for r in rungs] == ["sequential"] * 2 + [matcher] * 3
+
+
+@pytest.mark.parametrize(
+    ("matcher", "lost", "total", "worth"),
+    [
+        ("exhaustive", 1, 63, True),  # 1953 pairs
+        ("exhaustive", 1, 64, False),  # 2016
+        ("exhaustive", 3, 64, False),
+        ("exhaustive", 4, 64, True),  # more than a twentieth
+        ("sequential", 1, 200, True),  # 2000
+        ("sequential", 1, 201, False),
+    ],
+)
+def test_few_lost_of_many_are_no_reason_to_match_all_again(matcher, lost, total, worth):
+    attempt = dataclasses.replace(SETTINGS, matcher=matcher)
+    assert worth_matching(attempt, lost, total) == worth
+
+
+def test_who_is_given_up_is_told(scene, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(sys.modules["pipeline.sfm.reconstruct"], "MANY_PAIRS", 9)
+    monkeypatch.setattr(sys.modules["pipeline.sfm.reconstruct"], "FEW_LOST", 0.3)
+    write_image(tmp_path / "blank.png", np.full((HEIGHT, WIDTH, 3), 0.5))
+    names = [*scene.names[:4], "blank.png"]
+    for name in scene.names[:4]:
+        shutil.copy(scene.images / name, tmp_path / name)
+    found = solve(tmp_path, names, tmp_path / "w")
+    assert [a.label for a in found.attempts] == ["first", "placing on fewer matches"]
+    assert "no further attempt is made to place blank.png" in caplog.text
+
+
 def test_photos_without_features_are_refused(tmp_path):
     for name in ("a.png", "b.png", "c.png"):
         write_image(tmp_path / name, np.full((HEIGHT, WIDTH, 3), 0.5))
@@ -191,11 +229,11 @@ def test_photos_without_features_are_refused(tmp_path):
 
 
 def test_photos_of_different_things_are_refused(tmp_path):
-    names = ["a.png", "b.png"]
+    names = ["a.png", "b.png", "c.png"]
     for seed, name in enumerate(names):
         noise = np.random.default_rng(seed).random((HEIGHT, WIDTH, 3))
         write_image(tmp_path / name, noise)
-    with pytest.raises(UserError, match="no two of the 2 photos"):
+    with pytest.raises(UserError, match="no two of the 3 photos"):
         solve(tmp_path, names, tmp_path / "w", retry=False)
 
 
@@ -208,9 +246,10 @@ def test_one_photo_taken_several_times_is_refused(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("count", "k1", "good"), [(3, 0.1, True), (2, 0.1, False), (3, 9.0, False)]
+    ("count", "k1", "points", "good"),
+    [(3, 0.1, 15, True), (2, 0.1, 15, False), (3, 9.0, 15, False), (3, 0.1, 14, False)],
 )
-def test_models_of_two_photos_or_an_impossible_lens_count_for_nothing(count, k1, good):
+def test_models_of_too_little_or_an_impossible_lens_count_for_nothing(count, k1, points, good):
     """At f = 220 the corner of 240 x 180 lies at r^2 = (120^2 + 90^2) / 220^2 = 0.46."""
     model = pycolmap.Reconstruction()
     params = [FOCAL, WIDTH / 2, HEIGHT / 2, k1]
@@ -219,14 +258,45 @@ def test_models_of_two_photos_or_an_impossible_lens_count_for_nothing(count, k1,
     )
     model.add_camera_with_trivial_rig(camera)
     for number in range(1, count + 1):
-        image = pycolmap.Image(name=f"{number}", camera_id=1, image_id=number)
+        image = pycolmap.Image(
+            name=f"{number}", keypoints=np.zeros((points, 2)), camera_id=1, image_id=number
+        )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    assert usable(model, 20) == good
+    for index in range(points):
+        seen = [pycolmap.TrackElement(number, index) for number in range(1, count + 1)]
+        model.add_point3D(np.array([0.0, 0.0, 5.0]), pycolmap.Track(seen), np.zeros(3, np.uint8))
+    assert usable(model) == good
 
 
-def test_a_single_photo_is_refused(scene, tmp_path):
-    with pytest.raises(UserError, match="two or more"):
-        solve(scene.images, scene.names[:1], tmp_path)
+def drawn(folder: Path, cams, **how) -> list[str]:
+    """Pictures of the planes with a little noise, as a camera makes them."""
+    random = np.random.default_rng(0)
+    for name, cam in cams.items():
+        picture = draw(cam, **how)
+        write_image(folder / name, np.clip(picture + random.normal(0, 0.004, picture.shape), 0, 1))
+    return sorted(cams)
+
+
+@pytest.mark.parametrize("focal_px", [{}, {f"{i}.png": FOCAL for i in range(6)}])
+def test_turning_on_the_spot_is_refused(tmp_path, focal_px):
+    """With a free lens the solver finds cameras that move before a far wall; with the right focal length, the
+    global mapper places photos that see two points between them."""
+    ahead = [(-0.8 + 0.32 * i, 0.25 * (-1) ** i, 4.0) for i in range(6)]
+    cams = {
+        f"{i}.png": look_at(np.zeros(3), np.array(place), np.array([0.0, 1.0, 0.0]))
+        for i, place in enumerate(ahead)
+    }
+    names = drawn(tmp_path, cams)
+    free = dataclasses.replace(SETTINGS, refine_focal=True, refine_distortion=True)
+    with pytest.raises(UserError, match="turning on the spot"):
+        reconstruct(
+            tmp_path, None, names, work_dir=tmp_path / "w", settings=free, focal_px=focal_px
+        )
+
+
+def test_two_photos_are_refused(scene, tmp_path):
+    with pytest.raises(UserError, match=r"2 photos in .* three or more"):
+        solve(scene.images, scene.names[:2], tmp_path)
 
 
 @pytest.mark.parametrize("cut", [False, True])
@@ -234,9 +304,10 @@ def test_an_unreadable_image_is_named(scene, tmp_path, cut):
     """Of one that is cut short the header is whole, and pycolmap would find it blank."""
     whole = (scene.images / "v1.png").read_bytes()
     (tmp_path / "bad.png").write_bytes(whole[: len(whole) * 2 // 3] if cut else b"no picture")
-    shutil.copy(scene.images / "v0.png", tmp_path / "v0.png")
+    for name in ("v0.png", "v2.png"):
+        shutil.copy(scene.images / name, tmp_path / name)
     with pytest.raises(UserError, match=r"bad\.png"):
-        solve(tmp_path, ["v0.png", "bad.png"], tmp_path / "w")
+        solve(tmp_path, ["v0.png", "v2.png", "bad.png"], tmp_path / "w")
 
 
 @pytest.mark.parametrize("fault", ["missing", "size"])
