@@ -283,7 +283,7 @@ def _refuse_unnamable(files: Iterable[Path]) -> None:
     """UserError for a name that is not UTF-8: DVC cannot list the folder it lies in."""
     for path in files:
         try:
-            str(path.name).encode()
+            path.name.encode()
         except UnicodeEncodeError:
             shown = os.fsencode(path).decode(errors="backslashreplace")
             raise UserError(f"{shown}: the name is not UTF-8.", "Rename the file.") from None

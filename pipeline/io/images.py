@@ -21,7 +21,7 @@ PHOTO_SUFFIXES = frozenset(
 )
 # Pillow goes by what is in a file, whatever its name: a drawing in PostScript would be run by Ghostscript.
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF")
-OPTIONAL = {".avif": ("AVIF",), ".heic": ("HEIF",), ".heif": ("HEIF",)}
+OPTIONAL = {"AVIF": ".avif", "HEIF": ".heic"}  # where the packages are
 MAX_PIXELS = 200_000_000
 # Pillow's own limit is 179 million, fewer than some phones' photos have; MAX_PIXELS is told in words.
 Image.MAX_IMAGE_PIXELS = None
@@ -102,9 +102,7 @@ def image_size(path: Path) -> tuple[int, int]:
 @cache
 def _formats() -> tuple[str, ...]:
     """The formats that photos are read in here, registered once in every process."""
-    return FORMATS + tuple(
-        {kind for end, kinds in OPTIONAL.items() if can_read(end) for kind in kinds}
-    )
+    return FORMATS + tuple(kind for kind, suffix in OPTIONAL.items() if can_read(suffix))
 
 
 @cache

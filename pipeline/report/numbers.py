@@ -66,9 +66,8 @@ def table(metrics: Mapping[str, Any], other: Mapping[str, Any] | None) -> list[L
         if own is None and theirs is None:
             continue
         gain, ahead = "", None
-        if rising is None or name in apart:
-            pass
-        elif own is not None and theirs is not None and own != theirs:
+        known = own is not None and theirs is not None and own != theirs
+        if known and rising is not None and name not in apart:
             gain = f"{own - theirs:+{form}}"
             ahead = (own > theirs) == rising
         reason = metrics.get(name.split(".")[0], {}).get(f"{name.split('.')[1]}_reason", "")
