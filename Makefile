@@ -48,5 +48,6 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' -c constraints.txt
 	@touch $@
 
+# make clean SCENE=garden: what was made of one scene; DVC's cache and the scene's photos stay
 clean:
-	rm -rf artifacts .dvc/tmp
+	rm -rf artifacts/$(SCENE) artifacts/.work/$(SCENE)
