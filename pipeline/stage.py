@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import disk_fault, disk_faults, place_fault
+from pipeline.io.memory import memory_fault
 from pipeline.io.paths import SHARED, ScenePaths
 from pipeline.params import Section, read_folders, read_section
 
@@ -198,10 +199,15 @@ def _logged(name: str, stage: Callable[[], str | None], work: Path) -> str | Non
     except Exception as error:
         log.error("stage %s failed", name, exc_info=True)
         known = isinstance(error, UserError)
-        fault = None if known else disk_fault(work) or place_fault(error, work.parents[1])
+        fault = None if known else _fault(error, work)
         if fault is None:
             raise
         raise fault from error
+
+
+def _fault(error: Exception, work: Path) -> UserError | None:
+    """What the user can mend behind `error`: the disk, a place, the memory."""
+    return disk_fault(work) or place_fault(error, work.parents[1]) or memory_fault(error)
 
 
 def _parser(name: str, about: str) -> argparse.ArgumentParser:

@@ -7,12 +7,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 from tqdm import tqdm
 
-from pipeline.errors import UserError
-from pipeline.field.buffer import RayBuffer, photos_to_fit
-from pipeline.field.fit import Record, fit
+from pipeline.field.buffer import RayBuffer, depth_bounds, photos_to_fit
+from pipeline.field.fit import Record, fit, refuse_large
 from pipeline.field.model import build_around
 from pipeline.field.store import Checkpoint, fit_key, save_field
-from pipeline.io.atomic import publish_dir, write_text
+from pipeline.io.atomic import publish_dir, write_csv
+from pipeline.io.maps import read_map
 from pipeline.io.posed import read_posed_images
 from pipeline.io.transforms import read_transforms
 from pipeline.parallel import cores
@@ -29,6 +29,7 @@ class Params(Section):
 
     model: Literal["fast", "paper"]
     use_masks: bool
+    soft_masks: bool
     space: Literal["auto", "ndc", "contract"]
     steps: Annotated[int, Field(ge=1)]
     batch_rays: Annotated[int, Field(ge=64, le=65536)]
@@ -56,35 +57,31 @@ class Params(Section):
 def main(job: Job, params: Params) -> str:
     """Makes `nerf/` from the images, the masks (with use_masks) and the poses."""
     views = read_transforms(job.paths.poses / "transforms.json")
-    if not views:
-        raise UserError("No photo has a pose.", "See poses/poses.json for why.")
-    near = min(view.near for view in views.values()) * params.near_factor
-    far = max(view.far for view in views.values()) * params.far_factor
-    if near >= far:
-        raise UserError("Nothing is left between near and far.", "Lower nerf.near_factor.")
+    near, far = depth_bounds(views.values(), params.near_factor, params.far_factor)
     keep_masks = job.paths.refine if params.use_masks else None
-    photos = photos_to_fit(read_posed_images(job.paths.images, keep_masks, views), near, far)
+    images = read_posed_images(job.paths.images, keep_masks, views)
+    soft = None  # equation 4's M of kept pixels
+    if params.soft_masks:
+        files = {image.record: job.paths.attention / f"{image.record.stem}.exr" for image in images}
+        soft = {record.name: read_map(files[record], size=record.size) for record in files}
+    photos = photos_to_fit(images, near, far, soft)
     settings = params.model_dump(include=SETTINGS)
     cameras = list(views.values())
     field = build_around(params.model, cameras, near, far, device=job.device, **settings)
+    refuse_large(field, job.device)
     buffer = RayBuffer(photos, params.seed, job.device)
     key = fit_key(field, photos, params.model_dump(), job.device)
     checkpoint = Checkpoint(job.paths.work("nerf") / "checkpoint.safetensors", key)
     names = [photo.name for photo in photos]
-    del photos  # their pixels lie in the buffer, at a quarter of the size
+    del images, photos, soft  # their pixels lie in the buffer, at a quarter of the size
     steps, record = _fit(job, params, field, buffer, checkpoint)
-    about = {
-        "steps": steps,
-        "seed": params.seed,
-        "use_masks": params.use_masks,
-        "rays": buffer.count,
-        "photos": names,
-        "gains": None if record.gains is None else record.gains.tolist(),
-    }
+    gains = None if record.gains is None else record.gains.tolist()
+    about = {"steps": steps, "rays": buffer.count, "photos": names, "gains": gains}
+    about |= params.model_dump(include={"seed", "use_masks"})
     with publish_dir(job.paths.nerf) as fresh:
         save_field(fresh, field, near, far, about)
-        lines = [f"{step},{loss:.9g},{psnr:.6g}" for step, loss, psnr in record.rows]
-        write_text(fresh / "fit.csv", "\n".join(["step,loss,psnr", *lines]) + "\n")
+        rows = [(step, f"{loss:.9g}", f"{psnr:.6g}") for step, loss, psnr in record.rows]
+        write_csv(fresh / "fit.csv", ("step", "loss", "psnr"), rows)
     checkpoint.remove()
     psnr = record.rows[-1][2]
     return f"{len(names)} photos, {buffer.count:,} pixels, training PSNR {psnr:.2f} dB"

@@ -75,19 +75,19 @@ def _one_view(view: View, split: str, fill: tuple[float, float], device: str, *w
     write_depth(out / "depth" / f"{Path(view.name).stem}.exr", seen.depth)
     photo = read_image(images / view.name, size=(view.width, view.height))
     keep_mask = _keep_mask(kept, view.name, seen.depth)
-    mixed = composite_photo(photo, seen.rgb, keep_mask, feather_px=fill[0], reach_px=fill[1])
+    lit = seen.rgb * load_field(nerf, device).gains.get(view.name, np.float32(1.0))
+    mixed = composite_photo(photo, lit, keep_mask, feather_px=fill[0], reach_px=fill[1])
     write_image(out / "composite" / view.name, mixed)
 
 
-@functools.lru_cache(maxsize=512)
+@functools.cache  # of one run, whose folder has a name of its own; 5 bytes a pixel, where a fit takes 25
 def _witness(kept: Path, out: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     depth = read_depth(out / "depth" / f"{Path(name).stem}.exr")
     return _keep_mask(kept, name, depth), depth
 
 
 def _keep_mask(kept: Path, name: str, depth: np.ndarray) -> np.ndarray:
-    size = (depth.shape[1], depth.shape[0])
-    return read_keep_mask(kept / name, size) if kept.is_dir() else np.ones(depth.shape, bool)
+    return read_keep_mask(kept / name, (depth.shape[1], depth.shape[0]))
 
 
 def _count_seen(view: View, train: tuple[View, ...], kept: Path, out: Path) -> dict[str, float]:

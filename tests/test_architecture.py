@@ -23,6 +23,7 @@ RUNNER = {
     "pipeline.parallel",
     "pipeline.io",
     "pipeline.io.atomic",
+    "pipeline.io.memory",
     "pipeline.io.paths",
     "pipeline.io.shapes",
 }

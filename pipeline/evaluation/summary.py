@@ -98,11 +98,12 @@ def headline(metrics: Mapping[str, Any]) -> str:
     if metrics["test"]["psnr"] is None:
         reason = metrics["test"]["psnr_reason"]
         kept = metrics["selfcheck"]["kept_psnr"]
-        agreement = "" if kept is None else f"; {kept:.2f} dB against the photos beside the drops"
+        agreement = "" if kept is None else f"; {kept:.2f} dB against the photos outside the drops"
         return f"{found}{agreement}; no PSNR of clean views: {reason}"
     iou = "" if masks["iou"] is None else f", mask IoU {masks['iou']:.3f}"
     test = metrics["test"]
-    view = f"held-out views{judged(metrics)} {test['psnr']:.2f} dB, SSIM {test['ssim']:.3f}"
+    alike = "" if test["ssim"] is None else f", SSIM {test['ssim']:.3f}"
+    view = f"held-out views{judged(metrics)} {test['psnr']:.2f} dB{alike}"
     return f"{view}{iou}, {found}"
 
 

@@ -23,16 +23,14 @@ class Rays(NamedTuple):
 
 
 class Rendering(NamedTuple):
-    """What rays see: ``rgb`` ``(R, 3)``, ``depth`` ``(R,)`` along z, ``opacity`` ``(R,)`` before
-    the background closes the ray, ``weights`` ``(R, S)`` of the intervals between ``edges``
-    ``(R, S+1)``.
+    """What rays see: ``rgb`` ``(R, 3)``, ``depth`` ``(R,)`` along z, ``weights`` ``(R, S)`` of the intervals
+    between ``edges`` ``(R, S+1)``.
 
     ``edges`` are normalised positions along the ray: 0 near, 1 far.
     """
 
     rgb: Tensor
     depth: Tensor
-    opacity: Tensor
     weights: Tensor
     edges: Tensor
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from pipeline.errors import UserError
 from pipeline.field.base import Rays
 from pipeline.geometry.rays import pixel_rays
 from pipeline.io.posed import PosedImage
+from pipeline.io.transforms import View
 
 DEEPEST = 1e6  # far over near: beyond ten times this, 1/far is lost beside 1/near in 32 bits
 
@@ -46,9 +47,28 @@ class Batch(NamedTuple):
     view: Tensor
 
 
-def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list[PosedPhoto]:
+def depth_bounds(
+    views: Collection[View], near_factor: float, far_factor: float
+) -> tuple[float, float]:
+    """``near`` and ``far`` of all views together, times their factors; UserError when nothing is between."""
+    if not views:
+        raise UserError("No photo has a pose.", "See poses/poses.json for why.")
+    near = min(view.near for view in views) * near_factor
+    far = max(view.far for view in views) * far_factor
+    if near >= far:
+        raise UserError("Nothing is left between near and far.", "Lower nerf.near_factor.")
+    return near, far
+
+
+def photos_to_fit(
+    images: Iterable[PosedImage],
+    near: float,
+    far: float,
+    drop_masks: Mapping[str, np.ndarray] | None = None,
+) -> list[PosedPhoto]:
     """The images that are not held out, in their order; pixels that no ray leads to are not kept.
 
+    ``drop_masks`` ``(H, W)`` in [0, 1], by name, weigh kept pixels down: the loss's soft M.
     UserError when there is none, or nothing between ``near`` and ``far``, or more than 32 bits can tell apart.
     """
     if not 0 < near < far:
@@ -70,6 +90,7 @@ def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list
             image.view.intrinsics,
             near,
             far,
+            None if drop_masks is None else drop_masks[image.record.name],
         )
         for image in images
         if image.record.split == "train"
@@ -83,7 +104,7 @@ def photos_to_fit(images: Iterable[PosedImage], near: float, far: float) -> list
 
 
 class RayBuffer:
-    """Every kept pixel of every photo, in an order shuffled anew each epoch.
+    """Every kept pixel of every photo, in an order shuffled anew each epoch; the few that fill no batch wait.
 
     Covered pixels are not in it, so no ray is wasted on them. Holds 12 bytes per pixel; the rays
     are made when a batch is asked for.

@@ -43,7 +43,8 @@ def composite_photo(
         return photo.astype(np.float32)
     matched = np.clip(rendered * local_gain(photo, rendered, keep_mask, reach_px), 0.0, 1.0)
     distance = cv2.distanceTransform(keep_mask.astype(np.uint8), cv2.DIST_L2, 5)
-    own = np.clip((distance - 1.0) / max(feather_px, 1e-6), 0.0, 1.0)[..., None]
-    own[~keep_mask] = 0.0
+    own = keep_mask.astype(np.float32)[..., None]
+    if feather_px > 0:
+        own *= np.clip((distance - 1.0) / feather_px, 0.0, 1.0)[..., None]
     mixed = own * photo + (1.0 - own) * matched
     return np.where(own >= 1.0, photo, mixed).astype(np.float32)

@@ -33,6 +33,7 @@ from pipeline.field.steppers import (
     steppers_of,
     totals,
 )
+from pipeline.io.memory import refuse_without_room
 
 T = TypeVar("T")
 
@@ -114,10 +115,26 @@ def fit(
     return course
 
 
+def refuse_large(model: nn.Module, device: str) -> None:
+    """UserError when the memory that is free cannot hold what a fit keeps beside ``model``'s parameters.
+
+    Gradients, Adam's two moments and the mean, each as large. A GPU tells by itself.
+    """
+    held = sum(parameter.numel() * parameter.element_size() for parameter in model.parameters())
+    if device == "cpu":
+        refuse_without_room(
+            4 * held,
+            "the field's tables need",
+            "Lower nerf.table_log2, nerf.levels or nerf.features, or end other programs.",
+        )
+
+
 def _row(done: int, losses: list[Tensor]) -> tuple[int, float, float]:
     """Step, mean loss and PSNR of the steps since the last row; UserError when they are not finite."""
     loss, photometric = torch.stack(losses).mean(0).tolist()
-    _check_finite(loss, done - 1)
+    _check_finite(
+        loss + photometric, done - 1
+    )  # trimmed, errors that are no numbers leave the loss 0
     return done, loss, -10.0 * math.log10(max(photometric, 1e-12))
 
 
@@ -153,13 +170,13 @@ def _one_step(
 ) -> Tensor:
     """Gradients of every shard, then a step of every part; (loss, photometric loss) comes out."""
     pieces = _cut(batch, shards)
-    rays = batch.observed.shape[0]
+    weights = [_weight(piece) for piece in pieces]
+    total = max(sum(weights), 1e-12)
 
     def shard(number: int) -> Found:
         piece = pieces[number]
         source = torch.Generator().manual_seed((seed * 1_000_003 + step) * 64 + number)
-        share = piece.observed.shape[0] / rays
-        return found_in(model, light, steppers, piece, step, source, share)
+        return found_in(model, light, steppers, piece, step, source, weights[number] / total)
 
     done = _map(pool, shard, len(pieces))
 
@@ -168,6 +185,11 @@ def _one_step(
 
     _map(pool, advance, len(steppers))
     return torch.stack([piece.losses for piece in done]).sum(0)
+
+
+def _weight(batch: Batch) -> float:
+    """What the rays count together: each 1, or less under a soft mask (as eq. 4 is normalised)."""
+    return float((1.0 - batch.drop_mask).square().sum())
 
 
 def _cut(batch: Batch, shards: int) -> list[Batch]:

@@ -111,9 +111,7 @@ class GridField(nn.Module):
             out = self._shade(rays, self._propose(rays, self._bins(rays), None, None), None)
             middle = 0.5 * (out.edges[:, 1:] + out.edges[:, :-1])
             depth = depth_at((out.weights * middle).sum(-1), rays.near, rays.far)
-            sigma = torch.exp(out.shape[..., 0].clamp_max(MAX_LOG_DENSITY))
-            opacity = 1.0 - torch.exp(-(sigma * out.delta).sum(-1))
-            return Rendering(out.rgb, depth, opacity, out.weights, out.edges)
+            return Rendering(out.rgb, depth, out.weights, out.edges)
 
     def loss(
         self,

@@ -150,7 +150,12 @@ def build_around(
     cams = np.stack([camera.cam_from_world for camera in cameras])
     intrinsics = np.array([camera.intrinsics for camera in cameras])
     sizes = np.array([(camera.width, camera.height) for camera in cameras])
-    around = scene_space(space, cams, intrinsics, sizes, near, far)
+    try:
+        around = scene_space(space, cams, intrinsics, sizes, near, far)
+    except ValueError as error:
+        raise UserError(
+            f"nerf.space: {space} cannot hold this scene: {error}.", "Use auto or contract."
+        ) from None
     half = half_is_fast(model, device) if precision == "auto" else precision == "bfloat16"
     if model == "paper":
         half = half and device != "cpu"
@@ -189,6 +194,8 @@ def restore(
     try:
         space = _checked(Space.from_json(description["space"]))
         field = build(description["model"], description["config"], space, 0)
+        if not all(np.isfinite(array).all() for array in tensors.values()):
+            raise ValueError("its numbers are not all finite")
         field.load_state_dict({name: torch.from_numpy(a.copy()) for name, a in tensors.items()})
     except (
         LookupError,

@@ -32,8 +32,6 @@ class PaperConfig:
     density_noise: float = 1.0
     rate: float = 5e-4
     final_rate: float = 5e-5
-    steps: int = 200_000
-    batch_rays: int = 1024
     half: bool = False
 
 
@@ -150,8 +148,7 @@ class PaperField(nn.Module):
         weights = render_weights(sigma, delta)
         rgb = composite(weights, torch.sigmoid(colour).view(*s.shape, 3))
         with torch.no_grad():
-            opacity = weights.sum(-1)
-            mean = (weights * s).sum(-1) + (1.0 - opacity)
+            mean = (weights * s).sum(-1) + (1.0 - weights.sum(-1))
             depth = depth_at(mean.clamp(0.0, 1.0), rays.near, rays.far)
         edges = torch.cat([s, torch.ones_like(s[:, :1])], dim=-1)
-        return Rendering(rgb, depth, opacity, weights, edges)
+        return Rendering(rgb, depth, weights, edges)

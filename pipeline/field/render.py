@@ -16,11 +16,10 @@ CUDA_SAMPLES = 2**20  # at a time on a GPU, which has too little to do with fewe
 
 
 class RenderedView(NamedTuple):
-    """``rgb`` ``(H, W, 3)`` in [0, 1], ``depth`` and ``opacity`` ``(H, W)``; float32."""
+    """``rgb`` ``(H, W, 3)`` in [0, 1] and ``depth`` ``(H, W)``, float32."""
 
     rgb: np.ndarray
     depth: np.ndarray
-    opacity: np.ndarray
 
 
 Intrinsics = tuple[float, float, float, float, float]
@@ -68,10 +67,6 @@ def render_view(
         rays_o, rays_d = pixel_rays(pixel - rows * width, rows, camera, pose, distorted)
         bounds = [torch.full_like(rays_d[0], value) for value in (near, far)]
         out = field.render(Rays(rays_o.contiguous(), rays_d, *bounds))
-        parts.append(torch.cat([out.rgb, out.depth[:, None], out.opacity[:, None]], 1))
-    pixels = torch.cat(parts).cpu().view(height, width, 5).numpy()
-    return RenderedView(
-        np.ascontiguousarray(pixels[..., :3]),
-        np.ascontiguousarray(pixels[..., 3]),
-        np.ascontiguousarray(pixels[..., 4]),
-    )
+        parts.append(torch.cat([out.rgb, out.depth[:, None]], 1))
+    pixels = torch.cat(parts).cpu().view(height, width, 4).numpy()
+    return RenderedView(np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]))

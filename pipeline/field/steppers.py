@@ -103,7 +103,7 @@ class Stepper:
 
 
 class Average:
-    """The mean of parameters over the last ``steps - start`` of ``steps`` steps, every tenth and the last.
+    """The mean of parameters over the last ``share`` of ``steps`` steps: after every tenth and the last.
 
     Rates of Adam's kind leave parameters wandering about where they have arrived; their mean is
     nearer to it than any of them (Polyak and Juditsky, doi:10.1137/0330046).

@@ -28,11 +28,12 @@ log = logging.getLogger(__name__)
 
 
 class Fitted(NamedTuple):
-    """A field and the depths between which it was fitted."""
+    """A field, the depths between which it was fitted, and how bright (3,) each fitted photo is beside it."""
 
     field: GridField | PaperField
     near: float
     far: float
+    gains: Mapping[str, np.ndarray]
 
 
 def save_field(
@@ -50,13 +51,13 @@ def load_field(folder: Path, device: str) -> Fitted:
 
     The last one stays in memory until its files change: many views are rendered from one field.
     """
-    file = folder / "field.safetensors"
-    written = file.stat().st_mtime_ns if file.is_file() else 0
+    files = (folder / "field.safetensors", folder / "field.json")
+    written = tuple(file.stat().st_mtime_ns if file.is_file() else 0 for file in files)
     return _load_field(folder, device, written)
 
 
 @functools.lru_cache(maxsize=1)
-def _load_field(folder: Path, device: str, written: int) -> Fitted:
+def _load_field(folder: Path, device: str, written: tuple[int, ...]) -> Fitted:
     about = read_json(folder / "field.json", made_by="nerf")
     tensors, _ = load_tensors(folder / "field.safetensors", "Run `python -m stages.nerf` first.")
     field = restore(about, tensors).to(device)
@@ -64,12 +65,21 @@ def _load_field(folder: Path, device: str, written: int) -> Fitted:
         near, far = (float(about["bounds"][name]) for name in ("near", "far"))
         if not 0 < near < far < math.inf:
             raise ValueError(f"{near} to {far}")
+        gains = {} if about.get("gains") is None else _gains(about["photos"], about["gains"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
-            f"{folder / 'field.json'} tells no depths ({error!r}).",
+            f"{folder / 'field.json'} tells no depths or brightnesses ({error!r}).",
             "Run `python -m stages.nerf` again.",
         ) from None
-    return Fitted(field, near, far)
+    return Fitted(field, near, far, gains)
+
+
+def _gains(names: Sequence[str], values: Sequence[Sequence[float]]) -> dict[str, np.ndarray]:
+    """The factors by the photos' names; ValueError when they do not fit."""
+    gains = np.array(values, np.float32)
+    if gains.shape != (len(names), 3) or not (np.isfinite(gains) & (gains > 0)).all():
+        raise ValueError(f"{len(names)} photos with gains of shape {gains.shape}")
+    return dict(zip(names, gains, strict=True))
 
 
 def fit_key(
@@ -86,6 +96,8 @@ def fit_key(
         numbers = [*photo.intrinsics, photo.near, photo.far]
         for array in (photo.image, photo.keep_mask, photo.cam_from_world, np.array(numbers)):
             digest.update(np.ascontiguousarray(array).tobytes())
+        if photo.drop_mask is not None:
+            digest.update(np.ascontiguousarray(photo.drop_mask).tobytes())
     return digest.hexdigest()
 
 

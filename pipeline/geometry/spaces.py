@@ -140,7 +140,8 @@ def fit_space(
 ) -> Space:
     """The space around what the cameras ``(V, 4, 4)`` see between ``near`` and ``far`` ``(V,)``.
 
-    ``kind`` is ``ndc``, ``contract`` or ``auto`` (ndc for forward-facing captures).
+    ``kind`` is ``ndc``, ``contract`` or ``auto`` (ndc for forward-facing captures). ValueError for ``ndc``
+    when something that is seen lies beside or behind the mean camera.
     """
     if kind == "auto":
         kind = "ndc" if is_forward_facing(cam_from_world, corners, near) else "contract"
@@ -158,7 +159,9 @@ def fit_space(
     depth = 1.0 / ((1 - disparity) / near[:, None] + disparity / far[:, None])
     points = centres[:, None, None] + corners[:, :, None] * depth[:, None, :, None]
     ref = points.reshape(-1, 3) @ mean[:3, :3].T + mean[:3, 3]
-    nearest = max(float(ref[:, 2].min()), EPS)
+    nearest = float(ref[:, 2].min())
+    if nearest <= EPS:
+        raise ValueError("what the cameras see lies on all sides of the mean camera")
     mapped = ndc(torch.from_numpy(ref.T.copy()), nearest).numpy()
     low, high = mapped.min(1), mapped.max(1)
     high = np.maximum(high, low + EPS)

@@ -126,19 +126,36 @@ def _swap(fresh: Path, final: Path) -> None:
 
 
 @contextmanager
-def _beside(path: Path, data: bytes) -> Iterator[Path]:
-    """Yields a file beside `path` that holds `data`, flushed to disk; it is gone afterwards if not renamed."""
+def _fresh(path: Path) -> Iterator[Path]:
+    """Yields a name beside `path`; the file of that name is gone afterwards if not renamed."""
     with disk_faults(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.parent / f".{path.name}.tmp-{os.getpid()}"
         try:
-            with fresh.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
             yield fresh
         finally:
             fresh.unlink(missing_ok=True)
+
+
+@contextmanager
+def _beside(path: Path, data: bytes) -> Iterator[Path]:
+    """Yields a file beside `path` that holds `data`, flushed to disk; it is gone afterwards if not renamed."""
+    with _fresh(path) as fresh:
+        with fresh.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        yield fresh
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yields a name beside `path` to write to; the file is then flushed to disk and renamed to `path`."""
+    with _fresh(path) as fresh:
+        yield fresh
+        with fresh.open("rb+") as file:
+            os.fsync(file.fileno())
+        fresh.replace(path)
 
 
 def clear_torn(path: Path) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import psutil
 
+from pipeline.errors import UserError
+
 GROUPS = Path("/sys/fs/cgroup")
 OWN_GROUP = Path("/proc/self/cgroup")
 V2 = ("memory.max", "memory.current", "inactive_file")
@@ -34,6 +36,42 @@ def free_memory(groups: Path = GROUPS, own: Path = OWN_GROUP) -> int:
         if both is not None and held_both is not None:
             rooms.append(both - held_both + droppable)
     return max(0, min(rooms))
+
+
+def refuse_without_room(needed: float, what: str, hint: str) -> None:
+    """UserError when fewer than `needed` bytes are free for `what`: else the system would end the process."""
+    free = free_memory()
+    if needed > free:
+        raise UserError(
+            f"{what} about {needed / 1e9:.1f} GB of memory; {free / 1e9:.1f} GB are free.", hint
+        )
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether a request for memory that was refused stands behind `error`: Python's, OpenCV's or torch's."""
+    told = ("not enough memory", "can't allocate memory", "Failed to allocate", "bad_alloc")
+    while error is not None:
+        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+            return True
+        if any(words in str(error) for words in told):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def memory_fault(error: BaseException) -> UserError | None:
+    """The sentence for memory that ran out, behind `error`; None for other faults."""
+    if not is_out_of_memory(error):
+        return None
+    if "CUDA" in str(error):
+        return UserError(
+            "The GPU has not enough memory.",
+            "End what else runs on it, lower ingest.max_size, or compute on the processor: --device cpu.",
+        )
+    return UserError(
+        "There was not enough memory.",
+        "Lower ingest.max_size or ingest.frames, end other programs, or raise the container's limit.",
+    )
 
 
 def _limiting(groups: Path, own: Path) -> Iterator[tuple[Path, tuple[str, str, str]]]:

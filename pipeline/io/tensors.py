@@ -12,7 +12,7 @@ import safetensors
 import safetensors.numpy
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import write_bytes
+from pipeline.io.atomic import whole_file
 
 
 def save_tensors(
@@ -22,7 +22,8 @@ def save_tensors(
     arrays = {name: np.ascontiguousarray(np.asarray(tensors[name])) for name in sorted(tensors)}
     # One entry only: the format's writer keeps several in no fixed order, and the bytes would vary.
     header = {"metadata": json.dumps(dict(metadata), sort_keys=True)} if metadata else None
-    write_bytes(path, safetensors.numpy.save(arrays, metadata=header))
+    with whole_file(path) as fresh:  # not as one string of bytes: a fit's state would be held twice
+        safetensors.numpy.save_file(arrays, fresh, metadata=header)
 
 
 def load_tensors(path: Path, hint: str = "") -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from pipeline.errors import UserError
+from pipeline.io.memory import is_out_of_memory
 from pipeline.removal import autoencoder, quan, wen
 from pipeline.removal.autoencoder import ContextualAutoencoder
 from pipeline.removal.precision import products
@@ -150,10 +151,7 @@ def windows_of(frames: Sequence[Key], run: range) -> list[tuple[list[Key], int]]
 
 def too_large(error: BaseException, name: str) -> UserError | None:
     """What to tell when there was no memory for the photo `name`; None when `error` is another fault."""
-    told = ("not enough memory", "can't allocate memory")  # torch's on processors
-    if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and not any(
-        words in str(error) for words in told
-    ):
+    if not is_out_of_memory(error):
         return None
     return UserError(
         f"{name} is too large to be restored with the memory that is free.",

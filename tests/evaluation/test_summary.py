@@ -115,3 +115,5 @@ def test_an_image_too_small_for_a_measure_goes_without_it(
     assert {name for name in ("psnr", "ssim", "lpips") if test[name] is None} == missing
     for name in missing:
         assert "pixels each way" in test[f"{name}_reason"]
+    told = headline({"test": test, "poses": {"registered": 3, "total": 3}, "masks": {"iou": None}})
+    assert ("SSIM" in told) == ("ssim" not in missing)

@@ -234,6 +234,7 @@ def test_a_stage_before_its_input_exists(photos: Workshop, stage: str) -> None:
         ("render", "nerf", "nerf"),
         ("render", "nerf/field.safetensors", "nerf"),
         ("render", "poses", "poses"),
+        ("render", "refine", "refine"),
         ("render", "refine/view_3.png", "refine"),
         ("evaluate", "views", "render"),
         ("evaluate", "refine", "refine"),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import filelock
 import pytest
+import torch
 
 from tests.chain import project
 from tests.faults.workshop import SCENE, Workshop
@@ -79,6 +80,12 @@ def test_killed_while_writing(whole: Workshop) -> None:
     assert whole.run("attention").code == 0
     assert taken.items() <= whole.files().items()
     assert not list(whole.artifacts.glob(".*tmp-*"))
+
+
+def test_memory_that_runs_out(whole: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As torch tells it, for one view among many: a sentence, and the old views stay."""
+    monkeypatch.setattr("stages.render.composite_photo", lambda *_, **__: torch.empty(2**50))
+    whole.refuses("render", "There was not enough memory")
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,7 @@ OFF = np.array([0.012, -0.008, 0.01, 0.001, -0.002, 0.0015])  # metres, radians
 
 def seen_at(pose: np.ndarray) -> RenderedView:
     rgb, depth = photograph(pose, WIDTH, HEIGHT, FOCAL)
-    opaque = np.ones(depth.shape, np.float32)
-    return RenderedView(rgb.astype(np.float32), depth.astype(np.float32), opaque)
+    return RenderedView(rgb.astype(np.float32), depth.astype(np.float32))
 
 
 def pixels_off(pose: np.ndarray) -> float:

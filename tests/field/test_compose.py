@@ -35,6 +35,13 @@ def test_nothing_covered_returns_the_photo_and_all_covered_the_rendering() -> No
     np.testing.assert_allclose(out, clean, atol=1e-6)
 
 
+def test_without_a_fade_every_kept_pixel_is_the_photos_own() -> None:
+    clean, photo, keep = wet()
+    out = composite_photo(photo, clean * 0.9, keep, feather_px=0.0)
+    assert np.array_equal(out[keep], photo[keep])
+    np.testing.assert_allclose(out[~keep], clean[~keep], atol=0.01)
+
+
 def wall(shift: float, keep: np.ndarray) -> Witness:
     """A camera at x = shift that looks at a wall 2 away: depth 2 everywhere."""
     pose = np.eye(4)

@@ -16,7 +16,7 @@ import yaml
 from pipeline.errors import UserError
 from pipeline.field.base import Part
 from pipeline.field.buffer import Batch, PosedPhoto, RayBuffer
-from pipeline.field.fit import Stepper, fit
+from pipeline.field.fit import Stepper, _row, fit, refuse_large
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.model import build_around, describe, half_is_fast, restore, scene_space
 from pipeline.field.render import render_view
@@ -180,6 +180,40 @@ def test_soft_masks_reach_the_loss(photos: list[PosedPhoto]) -> None:
         models.append(field(photos))
         fit(models[-1], RayBuffer(marked, 0), steps=6, batch_rays=256, seed=0)
     assert same(*models)
+
+
+def test_shards_weigh_soft_masks_as_the_whole_batch_does(photos: list[PosedPhoto]) -> None:
+    """Equation 4 is normalised over all rays of a step: however it is cut, the gradients are the same."""
+    soft = np.zeros((30, 40), np.float32)
+    soft[:, :30] = 0.9
+    marked = [
+        PosedPhoto(**{**vars(photo), "drop_mask": soft * (i < 3)}) for i, photo in enumerate(photos)
+    ]
+    losses = []
+    for shards in (1, 4):
+        record = fit(
+            field(marked), RayBuffer(marked, 0), steps=1, batch_rays=256, seed=0, shards=shards
+        )
+        losses.append(record.rows[0][2])
+    assert losses[1] == pytest.approx(losses[0], abs=1e-4)
+
+
+def test_errors_that_are_no_numbers_end_the_fit_even_where_they_are_trimmed() -> None:
+    with pytest.raises(UserError, match="broke down near step 4"):
+        _row(5, [torch.tensor([0.0, float("nan")])])
+
+
+def test_tables_too_large_for_the_memory_are_told(
+    photos: list[PosedPhoto], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four times the parameters must be free: gradients, two moments, the mean."""
+    model = field(photos)
+    held = 4 * sum(parameter.nbytes for parameter in model.parameters())
+    monkeypatch.setattr("pipeline.io.memory.free_memory", lambda: held)
+    refuse_large(model, "cpu")
+    monkeypatch.setattr("pipeline.io.memory.free_memory", lambda: held - 1)
+    with pytest.raises(UserError, match="the field's tables need about"):
+        refuse_large(model, "cpu")
 
 
 def test_the_exposure_of_each_photo_is_found(photos: list[PosedPhoto]) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from pipeline.field.model import scene_space
+from pipeline.errors import UserError
+from pipeline.field.model import build_around, scene_space
 from pipeline.geometry.rays import pixel_rays
 from pipeline.geometry.spaces import fit_space, ndc
 
@@ -78,3 +81,14 @@ def test_sides_that_do_not_bulge_leave_the_bounds_to_the_corners_themselves() ->
                 gain = better
             corners[:, i] = x / gain, y / gain, 1.0
         assert space == fit_space("ndc", poses, corners, np.full(3, near), np.full(3, far))
+
+
+def test_normalised_coordinates_are_refused_where_cameras_look_at_each_other() -> None:
+    """Half a turn apart one camera's near points lie behind the mean camera, whatever is asked for."""
+    back = np.diag([-1.0, 1.0, -1.0, 1.0])
+    back[2, 3] = 8.0
+    cameras = [SimpleNamespace(cam_from_world=pose, intrinsics=(50.0, 50.0, 20.0, 15.0, 0.0), width=40,
+                               height=30) for pose in (np.eye(4), back)]  # fmt: skip
+    with pytest.raises(UserError, match=r"nerf\.space: ndc cannot hold this scene"):
+        build_around("fast", cameras, 1.0, 6.0, space="ndc", table_log2=8)
+    assert build_around("fast", cameras, 1.0, 6.0, table_log2=8).space.kind == "contract"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
+import yaml
 
 from pipeline.field.base import Rays
 from pipeline.field.paper_field import PaperConfig, PaperField, PaperNetwork
@@ -19,7 +22,8 @@ def test_the_papers_numbers() -> None:
     assert (config.coarse_samples, config.fine_samples) == (64, 64)
     assert config.density_noise == 1.0
     assert (config.rate, config.final_rate) == (5e-4, 5e-5)
-    assert (config.steps, config.batch_rays) == (200_000, 1024)
+    fit = yaml.safe_load((Path(__file__).parents[2] / "params.yaml").read_text())["nerf"]
+    assert (fit["paper_steps"], fit["paper_batch_rays"], fit["rate"]) == (200_000, 1024, 1.0)
 
 
 def test_each_network_has_the_public_codes_parameter_count() -> None:

@@ -43,6 +43,15 @@ def test_a_saved_field_comes_back_and_a_newer_one_replaces_it(tmp_path: Path) ->
     assert json.loads((tmp_path / "field.json").read_text())["steps"] == 7
 
 
+def test_a_field_of_no_numbers_is_told(tmp_path: Path) -> None:
+    field = GridField(TINY, SPACE, 1)
+    with torch.no_grad():
+        field.colour_out.bias[0] = float("nan")
+    save_field(tmp_path, field, 1.0, 9.0, {})
+    with pytest.raises(UserError, match="its numbers are not all finite"):
+        load_field(tmp_path, "cpu")
+
+
 @pytest.mark.parametrize(
     ("where", "value"),
     [

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import psutil
 import pytest
+import torch
 
-from pipeline.io.memory import free_memory
+from pipeline.io.memory import free_memory, is_out_of_memory, memory_fault
 
 
 @pytest.fixture(autouse=True)
@@ -71,3 +74,22 @@ def test_a_place_that_only_the_host_sees(tmp_path: Path) -> None:
 def test_more_held_than_allowed_is_nothing_free(tmp_path: Path) -> None:
     _group(tmp_path / "groups", max=40, current=60, swap__max=0, swap__current=0)
     assert _free(tmp_path, "0::/\n") == 0
+
+
+@pytest.mark.parametrize("take", [lambda: torch.empty(2**50), lambda: np.empty(2**50)])
+def test_memory_that_is_not_there_is_known_behind_other_errors(take: Any) -> None:
+    try:
+        try:
+            take()
+        except Exception as error:
+            raise RuntimeError("render failed on a.png") from error
+    except RuntimeError as error:
+        assert is_out_of_memory(error)
+        fault = memory_fault(error)
+    assert fault is not None and fault.what == "There was not enough memory."
+
+
+def test_a_full_gpu_is_told_as_such_and_other_errors_are_not() -> None:
+    full = memory_fault(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB."))
+    assert full is not None and full.what.startswith("The GPU")
+    assert memory_fault(RuntimeError("shapes do not match")) is None
