@@ -124,7 +124,7 @@ def refuse_large(model: nn.Module, device: str) -> None:
     if device == "cpu":
         refuse_without_room(
             4 * held,
-            "the field's tables need",
+            "the field's tables",
             "Lower nerf.table_log2, nerf.levels or nerf.features, or end other programs.",
         )
 

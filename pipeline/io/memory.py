@@ -39,11 +39,12 @@ def free_memory(groups: Path = GROUPS, own: Path = OWN_GROUP) -> int:
 
 
 def refuse_without_room(needed: float, what: str, hint: str) -> None:
-    """UserError when fewer than `needed` bytes are free for `what`: else the system would end the process."""
+    """UserError when fewer bytes are free than `what` (in the plural) needs: else the system would end the process."""
     free = free_memory()
     if needed > free:
         raise UserError(
-            f"{what} about {needed / 1e9:.1f} GB of memory; {free / 1e9:.1f} GB are free.", hint
+            f"{what} need about {needed / 1e9:.1f} GB of memory; {free / 1e9:.1f} GB are free.",
+            hint,
         )
 
 
