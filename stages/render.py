@@ -17,6 +17,7 @@ from pipeline.field.visibility import Witness, shares, witness_count
 from pipeline.geometry.trajectory import camera_path
 from pipeline.io.atomic import publish_dir, write_json
 from pipeline.io.images import as_bytes, read_image, write_image
+from pipeline.io.made_of import write_inputs
 from pipeline.io.maps import read_depth, write_depth, write_map
 from pipeline.io.masks import read_keep_mask
 from pipeline.io.posed import posed_records
@@ -49,7 +50,7 @@ def main(job: Job, params: Params) -> str:
     with publish_dir(paths.views) as fresh:
         for folder in ("test", "input", "composite", "depth", "seen"):
             (fresh / folder).mkdir()
-        fill = (params.feather_px, params.gain_px)
+        fill = {"feather_px": params.feather_px, "reach_px": params.gain_px}
         how_to = (job.device, paths.nerf, paths.images, paths.refine, fresh)
         tasks = {r.name: (views[r.name], r.split, fill, *how_to) for r in records}
         map_named(_one_view, tasks, job_label="render", **how)
@@ -59,6 +60,7 @@ def main(job: Job, params: Params) -> str:
             write_json(fresh / "seen.json", map_named(_count_seen, items, job_label="seen", **how))
         if filmed := params.path_frames if len(views) > 1 else 0:
             _film(job, params, list(views.values()), fresh, how)
+        write_inputs(fresh, paths)
     return f"{len(records)} views, {filmed} frames of video in {paths.views}"
 
 
@@ -68,7 +70,7 @@ def _render(nerf: Path, device: str, view: View, pose: np.ndarray, scale: float)
     return render_view(fitted.field, pose, camera, size, fitted.near, fitted.far, device=device)
 
 
-def _one_view(view: View, split: str, fill: tuple[float, float], device: str, *where: Path) -> None:
+def _one_view(view: View, split: str, fill: dict[str, float], device: str, *where: Path) -> None:
     nerf, images, kept, out = where
     seen = _render(nerf, device, view, view.cam_from_world, 1.0)
     write_image(out / ("test" if split == "test" else "input") / view.name, seen.rgb)
@@ -76,8 +78,7 @@ def _one_view(view: View, split: str, fill: tuple[float, float], device: str, *w
     photo = read_image(images / view.name, size=(view.width, view.height))
     keep_mask = _keep_mask(kept, view.name, seen.depth)
     lit = seen.rgb * load_field(nerf, device).gains.get(view.name, np.float32(1.0))
-    mixed = composite_photo(photo, lit, keep_mask, feather_px=fill[0], reach_px=fill[1])
-    write_image(out / "composite" / view.name, mixed)
+    write_image(out / "composite" / view.name, composite_photo(photo, lit, keep_mask, **fill))
 
 
 @functools.cache  # of one run, whose folder has a name of its own; 5 bytes a pixel, where a fit takes 25
@@ -101,9 +102,8 @@ def _count_seen(view: View, train: tuple[View, ...], kept: Path, out: Path) -> d
 
 def _film(job: Job, params: Params, views: list[View], out: Path, how: dict[str, Any]) -> None:
     fitted = load_field(job.paths.nerf, job.device)
-    cams = [view.cam_from_world for view in views]
     bounds = (fitted.near, fitted.far) if fitted.field.space.kind == "ndc" else None
-    poses = camera_path(cams, bounds, params.path_frames)
+    poses = camera_path([view.cam_from_world for view in views], bounds, params.path_frames)
     how_seen = (job.paths.nerf, job.device, views[len(views) // 2])
     items = {f"{i:05d}": (*how_seen, pose, params.path_scale) for i, pose in enumerate(poses)}
     size = int(3 * how_seen[2].width * how_seen[2].height * params.path_scale**2)

@@ -170,6 +170,16 @@ def write_bytes(path: Path, data: bytes) -> None:
         fresh.replace(path)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Gives the file `source` a second name, or a copy where the disk knows no links."""
+    with disk_faults(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            target.hardlink_to(source)
+        except (OSError, NotImplementedError):
+            shutil.copyfile(source, target)
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 `text` to `path`, whole or not at all."""
     write_bytes(path, text.encode())

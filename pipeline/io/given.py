@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.io.atomic import read_json
-from pipeline.io.transforms import GL_FROM_CV, View
+from pipeline.io.transforms import GL_FROM_CV, ORIGIN, View
 
 SAME_SHAPE = 0.01  # how far the ratios of width to height of a photo and its camera may differ
 RIGID = 2e-4  # how far R R^T may be from the identity: as far as four decimals leave it
@@ -229,6 +229,7 @@ def _nerfstudio_view(path: Path, content: dict[str, Any], frame: dict[str, Any])
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     world_from_gl = np.asarray(frame["transform_matrix"], np.float64).reshape(4, 4)
     world_from_gl = checked_rigid(world_from_gl, f"{path}: the pose of {photo.name}")
+    world_from_gl[:3, 3] += np.asarray(content.get("world_origin", ORIGIN), np.float64).reshape(3)
     mask = frame.get("mask_path")
     view = GivenView(
         photo=photo,

@@ -21,11 +21,11 @@ from pipeline.io.transforms import View
 def poses_bounds(views: Sequence[View]) -> np.ndarray:
     """The (N, 17) float64 array of `views`, which are without distortion, in name order.
 
-    Places lie in the coordinates that the capture came with.
+    Places lie in the views' own world, near its origin: the readers count in 32 bits.
     """
     rows = []
     for view in sorted(views, key=lambda view: view.name):
-        right, down, ahead, place = view.as_given.world_from_cam[:3].T
+        right, down, ahead, place = view.world_from_cam[:3].T
         size = np.array([view.height, view.width, view.fx])
         matrix = np.stack([down, right, -ahead, place, size], axis=1)
         rows.append(np.concatenate([matrix.ravel(), [view.near, view.far]]))

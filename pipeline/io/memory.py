@@ -39,7 +39,7 @@ def free_memory(groups: Path = GROUPS, own: Path = OWN_GROUP) -> int:
 
 
 def refuse_without_room(needed: float, what: str, hint: str) -> None:
-    """UserError when fewer bytes are free than `what` (in the plural) needs: else the system would end the process."""
+    """UserError when fewer bytes are free than `what` (in the plural) need: the system would end it unasked."""
     free = free_memory()
     if needed > free:
         raise UserError(

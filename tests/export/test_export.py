@@ -17,93 +17,32 @@ from pipeline.geometry.fuse import DepthView, fuse
 from pipeline.io.capture import find_capture
 from pipeline.io.images import read_image, write_image
 from pipeline.io.llff import poses_bounds
-from pipeline.io.maps import read_depth, write_depth
-from pipeline.io.masks import read_keep_mask, write_keep_mask
+from pipeline.io.maps import read_depth
+from pipeline.io.masks import read_keep_mask
 from pipeline.io.ply import read_ply, write_ply
-from pipeline.io.scene import ImageRecord, write_images_json
 from pipeline.io.straighten import common_pinholes
-from pipeline.io.transforms import View, write_transforms
-from pipeline.sfm import read_colmap, write_sparse
+from pipeline.sfm import read_colmap
 from pipeline.stage import Job
 from stages import export
-
-WIDTH, HEIGHT, K1 = 80, 60, 0.08
-NAMES = ("a.png", "b.png", "c.png")
-PARAMS = export.Params(
-    formats=["nerfstudio", "colmap", "llff", "ply", "depth", "photos"],
-    llff_factor=2,
-    dense_step=1,
-    dense_agreeing=1,
-)
-
-
-def _view(name: str, x: float, k1: float = K1) -> View:
-    pose = np.eye(4)
-    pose[0, 3] = -x
-    return View(name, pose, 70.0, 70.0, WIDTH / 2, HEIGHT / 2, k1, WIDTH, HEIGHT, 1.5, 4.0)
-
-
-VIEWS = [_view(name, 0.1 * number) for number, name in enumerate(NAMES)]
-POINTS = np.array([[0.2, 0.1, 2.0], [-0.3, 0.2, 2.0], [0.1, -0.4, 2.0]])
-
-
-def _bent(points: np.ndarray, view: View) -> np.ndarray:
-    """Pixels of world points (N, 3) through the view's lens, written out."""
-    cam = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-    x, y = cam[:, 0] / cam[:, 2], cam[:, 1] / cam[:, 2]
-    gain = 1 + view.k1 * (x * x + y * y)
-    return np.stack([view.fx * x * gain + view.cx, view.fy * y * gain + view.cy], axis=1)
-
-
-def _model() -> pycolmap.Reconstruction:
-    model = pycolmap.Reconstruction()
-    params = [70.0, WIDTH / 2, HEIGHT / 2, K1]
-    camera = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params, camera_id=1
-    )
-    model.add_camera_with_trivial_rig(camera)
-    for number, view in enumerate(VIEWS, start=5):
-        pose = view.cam_from_world
-        image = pycolmap.Image(
-            name=view.name, keypoints=_bent(POINTS, view), camera_id=1, image_id=number
-        )
-        model.add_image_with_trivial_frame(
-            image,
-            pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(pose[:3, :3])), pose[:3, 3]),
-        )
-    for index, point in enumerate(POINTS):
-        track = pycolmap.Track([pycolmap.TrackElement(n, index) for n in (5, 6, 7)])
-        model.add_point3D(point, track, np.array([10, 20, 30], np.uint8))
-    return model
-
-
-def _exported(root: Path, params: export.Params, origin: tuple[float, float, float]) -> Path:
-    """A scene of a grey wall at depth 2, dropped at the left in b, with its views; exported."""
-    job = Job(root, "made", None, "cpu", None, False)
-    paths = job.paths
-    grey = np.full((HEIGHT, WIDTH, 3), 0.5)
-    for name in NAMES:
-        keep_mask = np.ones((HEIGHT, WIDTH), bool)
-        keep_mask[:, :20] = name != "b.png"
-        write_image(paths.images / name, grey)
-        write_keep_mask(paths.masks / name, keep_mask)
-        for kind in ("composite", "input"):
-            write_image(paths.views / kind / name, grey)
-        (paths.views / "depth").mkdir(exist_ok=True)
-        write_depth(paths.views / "depth" / f"{name[0]}.exr", np.full((HEIGHT, WIDTH), 2.0))
-    records = [ImageRecord(n, n, "", WIDTH, HEIGHT, None, "train", 0) for n in NAMES]
-    write_images_json(paths.images, records)
-    views = [replace(view, origin=origin) for view in VIEWS]
-    write_transforms(paths.poses / "transforms.json", views)
-    write_sparse(_model(), paths.poses / "sparse")
-    export.main(job, params)
-    return paths.artifacts / "export"
+from tests.export.made import (
+    HEIGHT,
+    K1,
+    NAMES,
+    PARAMS,
+    POINTS,
+    VIEWS,
+    WIDTH,
+    bent,
+    exported,
+    lens_at,
+    scene,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Everything, of a world that begins where the capture's does."""
-    return _exported(tmp_path_factory.mktemp("export"), PARAMS, (0.0, 0.0, 0.0))
+    return exported(scene(tmp_path_factory.mktemp("export")))
 
 
 def test_the_common_pinhole_is_covered_wholly_and_no_wider() -> None:
@@ -113,8 +52,8 @@ def test_the_common_pinhole_is_covered_wholly_and_no_wider() -> None:
     x, y = WIDTH / 2 / straight.fx, HEIGHT / 2 / straight.fx
     gain = 1 + K1 * (x * x + y * y)
     assert 70 * x * gain == pytest.approx(WIDTH / 2, rel=1e-6), "the corner touches the edge"
-    assert common_pinholes([_view("a.png", 0, 0.0)])["a.png"].fx == pytest.approx(70.0)
-    barrel = common_pinholes([_view("a.png", 0, -0.1)])["a.png"]
+    assert common_pinholes([lens_at("a.png", 0, 0.0)])["a.png"].fx == pytest.approx(70.0)
+    barrel = common_pinholes([lens_at("a.png", 0, -0.1)])["a.png"]
     y = HEIGHT / 2 / barrel.fx  # the middle of the upper edge is the first to leave the frame
     assert 70 * y * (1 - 0.1 * y * y) == pytest.approx(HEIGHT / 2, rel=1e-6)
 
@@ -133,15 +72,15 @@ def test_llff_as_the_official_loader_reads_it(made: Path) -> None:
     assert (height, width) == (HEIGHT // factor, WIDTH // factor)
     # Columns are (down, right, back): the loader makes (right, up, back) of them.
     poses = np.concatenate([poses[:, 1:2], -poses[:, 0:1], poses[:, 2:]], axis=1)
-    for number, view in enumerate(VIEWS):
+    for number, one in enumerate(VIEWS):
         camera_to_world = poses[:, :4, number]
         # Its rays: d = ((i - W/2) / f, -(j - H/2) / f, -1) in the camera, OpenGL axes.
         point = POINTS[0]
         in_camera = camera_to_world[:, :3].T @ (point - camera_to_world[:, 3])
         i = width / 2 + focal * in_camera[0] / -in_camera[2]
         j = height / 2 - focal * in_camera[1] / -in_camera[2]
-        straight = common_pinholes(VIEWS)[view.name]
-        expected = _bent(point[None], straight)[0] / factor
+        straight = common_pinholes(VIEWS)[one.name]
+        expected = bent(point[None], straight)[0] / factor
         assert (i, j) == pytest.approx(tuple(expected))
     assert np.allclose(bounds, [[1.5] * 3, [4.0] * 3])
     mask = np.load(made / "llff/rainMask.npy")
@@ -188,15 +127,6 @@ def test_our_own_door_reads_it_back(made: Path, door: str) -> None:
     assert capture.masked_by == ("rainMask.npy" if door == "llff" else "mask pictures")
 
 
-def test_points_lie_where_the_capture_had_them(made: Path, tmp_path: Path) -> None:
-    """Metres of UTM, sparse and dense, to a tenth of a millimetre."""
-    utm = (412345.678, 5_654_321.25, 312.5)
-    far = _exported(tmp_path, PARAMS.model_copy(update={"formats": ["ply"]}), utm)
-    for name in ("sparse", "dense"):
-        here, there = (read_ply(folder / f"ply/{name}.ply")[0] for folder in (made, far))
-        assert np.allclose(there - np.array(utm), here, rtol=0, atol=1e-4)
-
-
 def test_photos_depth_and_points(made: Path) -> None:
     with Image.open(made / "photos/a.jpg") as photo:
         equivalent = photo.getexif().get_ifd(0x8769)[0xA405]
@@ -214,9 +144,9 @@ def test_photos_depth_and_points(made: Path) -> None:
 
 
 def test_a_variant_is_exported_beside_its_fit_not_over_its_scene(made: Path) -> None:
-    """The variant has no clean photos here; those of the scene must still be where they were."""
+    """The variant has no views here; what the scene exported must still be where they were."""
     job = Job(made.parents[2], "made", "unmasked", "cpu", None, False)
-    export.main(job, PARAMS.model_copy(update={"formats": ["nerfstudio", "photos"]}))
+    export.main(job, PARAMS)
     assert len(list((made / "photos").iterdir())) == len(NAMES)
     assert (made.parent / "unmasked/export/nerfstudio/transforms.json").is_file()
 

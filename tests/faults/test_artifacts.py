@@ -299,3 +299,16 @@ def test_a_backbone_that_is_none(whole: Workshop) -> None:
     whole.refuses("evaluate", "alexnet.pth")
     _text(whole.root / "weights/alexnet.pth")
     whole.refuses("evaluate", "alexnet.pth")
+
+
+def test_views_that_masks_were_repaired_after_are_not_exported(whole: Workshop) -> None:
+    """What `render` wrote down of its inputs tells, and nothing of an export is begun."""
+    whole.set("export", formats=["photos"])
+    mask = min((whole.artifacts / "refine").glob("*.png"))
+    as_it_was = mask.read_bytes()
+    height, width = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED).shape
+    write_keep_mask(mask, np.ones((height, width), bool))
+    whole.refuses("export", "was rendered from other masks than", "stages.render` again")
+    mask.write_bytes(as_it_was)
+    done = whole.run("export")
+    assert done.code == 0 and "views/" not in done.said, "the same bytes, however often written"
