@@ -77,7 +77,7 @@ def test_dvc_lists_the_parameters_that_a_stage_reads(name: str) -> None:
 def test_the_wet_scenes_follow_the_code_that_renders_them() -> None:
     """`synthesize` can do more, paint on photos that lie anywhere; these scenes are ray traced."""
     content = yaml.safe_load((ROOT / "experiments/scenes/dvc.yaml").read_text())
-    deps = {dep.removeprefix("../../") for dep in content["stages"]["scene"]["do"]["deps"]}
+    deps = {dep.removeprefix(".code/") for dep in content["stages"]["scene"]["do"]["deps"]}
     assert {"stages/synthesize.py", "pipeline/drops", *_code("pipeline.drops.storing")} <= deps
 
 

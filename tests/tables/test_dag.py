@@ -21,13 +21,15 @@ from pipeline.params import read_folders, read_params, read_section, stage_names
 from pipeline.tables.rows import ROWS
 from tests.test_architecture import true_code_dependencies
 
-TABLES = Path(__file__).resolve().parents[2] / "experiments/tables"
+ROOT = Path(__file__).resolve().parents[2]
+SCENES, TABLES = ROOT / "experiments/scenes", ROOT / "experiments/tables"
 DAG: dict[str, dict[str, Any]] = {
     name: entry
     for file in ("stages.yaml", "table.yaml")
     for name, entry in yaml.safe_load((TABLES / file).read_text())["stages"].items()
 }
 UP = "../../../"
+CODE = ".code/"
 
 
 def stages_of(entry: dict[str, Any]) -> set[str]:
@@ -47,17 +49,32 @@ def test_code_dependencies_are_what_the_stages_import(name: str) -> None:
     code = {f"stages/{stage}.py" for stage in stages}
     code |= {path for stage in stages for path in true_code_dependencies(stage)}
     code = {"pipeline/io" if path.startswith("pipeline/io/") else path for path in code}
-    listed = {dep.removeprefix(UP) for dep in DAG[name]["deps"] if dep.startswith(UP)}
-    assert {path for path in listed if path.startswith(("pipeline/", "stages/"))} == code
+    listed = {dep.removeprefix(CODE) for dep in DAG[name]["deps"] if dep.startswith(CODE)}
+    assert listed == code
 
 
+@pytest.mark.parametrize("folder", [SCENES, *(TABLES / profile for profile in PROFILES)])
+def test_folders_are_followed_from_within_the_repository(folder: Path) -> None:
+    """Of a folder outside DVC would follow caches too: a repository's .dvcignore ends with it."""
+    scenes = yaml.safe_load((SCENES / "dvc.yaml").read_text())["stages"]["scene"]["do"]
+    for dep in {dep for entry in (scenes, *DAG.values()) for dep in entry["deps"]}:
+        assert not dep.startswith("../") or Path(dep).suffix, f"{dep}: a folder"
+    for name in ("pipeline", "stages"):
+        assert (folder / CODE / name).readlink().parts[0] == ".."
+        assert (folder / CODE / name).resolve() == ROOT / name
+    assert "__pycache__" in (folder / ".dvcignore").read_text().split("\n")
+
+
+@pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("name", DAG)
-def test_every_section_that_the_stages_read_is_followed(name: str) -> None:
+def test_every_section_that_the_stages_read_is_followed(name: str, profile: str) -> None:
     keys = {file: set(some) for entry in DAG[name]["params"] for file, some in entry.items()}
     assert keys[f"{UP}params.yaml"] == stages_of(DAG[name])
-    for file, place in (("../params.yaml", TABLES), ("params.yaml", TABLES / "quick")):
+    for file, place in (("../params.yaml", TABLES), ("params.yaml", TABLES / profile)):
         own = yaml.safe_load((place / "params.yaml").read_text())
         assert keys.get(file, set()) >= stages_of(DAG[name]) & set(own)
+    assert f"scenes.{'all' if name == 'table' else '${scene}'}" in keys["../params.yaml"]
+    assert not {"scenes", "variants"} & set(own), "a profile's own are not followed"
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -107,7 +107,7 @@ def _locked(root: Path, steps: dict[str, int], code: dict[str, str]) -> None:
         f"fit@made-{name}": {
             "cmd": "fit",
             "deps": [
-                {"path": "../pipeline/field", "md5": code.get(name, "1.dir")},
+                {"path": ".code/pipeline/field", "md5": code.get(name, "1.dir")},
                 {"path": f"artifacts/made/{name}/own", "md5": name},
             ],
             "params": {
@@ -149,7 +149,7 @@ def test_rows_that_were_not_made_alike_are_told(paths: ScenePaths, tmp_path: Pat
     assert "Not made alike" in (tmp_path / "tables/comparison.tex").read_text()
     _locked(tmp_path, same, {"loop-0": "2.dir"})
     table.main(job(tmp_path), PARAMS)
-    told = "DerainNeRF with the loop (ours) (seed 0) had another ../pipeline/field than the rest."
+    told = "DerainNeRF with the loop (ours) (seed 0) had another pipeline/field than the rest."
     assert told in (tmp_path / "tables/tables.md").read_text()
 
 
@@ -167,7 +167,7 @@ def test_scenes_are_named_where_they_were_not_made_alike() -> None:
 def test_what_dvc_itself_writes_is_read(tmp_path: Path) -> None:
     lock = Path(__file__).resolve().parents[2] / "experiments/scenes/dvc.lock"
     made = read_recorded([lock])["data/street"]
-    assert "synthesize of params.yaml" in made and made["../../pipeline/drops"].endswith(".dir")
+    assert "synthesize of params.yaml" in made and made["pipeline/drops"].endswith(".dir")
     assert read_recorded([]) == {}
 
 
