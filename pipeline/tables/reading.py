@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.io.accounts import judged
 from pipeline.tables.rows import Row
 from pipeline.tables.statistics import mean
 
@@ -41,6 +42,24 @@ def view_scores(text: str, row: Row) -> dict[str, float]:
         if values and all(math.isfinite(value) for value in values):
             scores[number] = mean(values)
     return scores
+
+
+def why_missing(row: Row, seeds: Sequence[int], on_lens: bool) -> str:
+    """Why a row of a scene has no metrics: for some of its `seeds`, or, without any named, for none at all."""
+    if row.key == "unaveraged" and not on_lens:
+        return "equation 5 is for drops on the lens; without it the masks are those of the next row"
+    return "not computed" + (f" for seed {', '.join(map(str, seeds))}" if seeds else "")
+
+
+def why_unscored(metrics: Mapping[str, Any], row: Row) -> str:
+    """Why a row that has metrics is without numbers in the tables: a mean over some images alone is none."""
+    poses, reason = metrics["poses"], metrics.get(row.kind, {}).get("psnr_reason")
+    if reason:
+        return str(reason)
+    some = judged(metrics) if row.kind == "test" else ""
+    lost = poses["registered"] < poses["total"]
+    placed = f"; {poses['registered']} of {poses['total']} photos have a pose" if lost else ""
+    return f"not all of its images could be judged{some}{placed}"
 
 
 def mask_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
