@@ -210,7 +210,8 @@ def test_stages_run_in_a_copy_end_as_they_would_here(
     monkeypatch.setattr(warm, "LOADED", ["pipeline.stage"])
     (tmp_path / "params.yaml").write_text("scenes: {a: {}}\nrefine: {rounds: many}\n")
     with warm.serving() as environment:
-        monkeypatch.setenv(steps.ADDRESS, environment[steps.ADDRESS])
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
         assert steps.main([]) == 0
         assert steps.main(["refine", "--scene", "a"]) == 2
         with Client(environment[steps.ADDRESS]):
@@ -219,6 +220,42 @@ def test_stages_run_in_a_copy_end_as_they_would_here(
             assert set(several.map(steps.main, [[]] * 40)) == {0}
     assert (tmp_path / "artifacts").exists() is False
     assert steps.main([]) == 1
+
+
+def test_after_a_change_of_the_code_stages_run_where_it_is_loaded_anew(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The copies are of what was loaded before: DVC would take their rows for the new code's."""
+    monkeypatch.setattr(warm, "LOADED", ["pipeline.stage"])
+    monkeypatch.setattr(steps, "run_stages", lambda words: 7)  # here; not in the copies
+    for folder in ("pipeline", "stages"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.py").write_text("before = 1\n")
+    monkeypatch.setattr("pipeline.io.code.PIPELINE", tmp_path / "pipeline")
+    with warm.serving() as environment:
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        assert steps.main([]) == 0
+        for folder in ("pipeline", "stages"):
+            file = tmp_path / folder / "a.py"
+            file.write_text("after = 1\n")
+            assert steps.main([]) == 7
+            file.write_text("before = 1\n")
+            assert steps.main([]) == 0
+
+
+def test_a_mistake_in_the_parameters_is_told_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny/params.yaml").write_text("nerff: {steps: 60}\n")
+    monkeypatch.setattr(run, "HERE", tmp_path)
+    monkeypatch.setattr(run.signal, "signal", lambda number, how: None)
+    monkeypatch.setattr(run.subprocess, "run", lambda *words, **how: pytest.fail("went on"))
+    monkeypatch.setattr(sys, "argv", ["run", "tiny"])
+    assert run.main() == 2
+    told = "params.yaml: unknown section: nerff. Did you mean nerf?\n  Correct it and run again.\n"
+    assert capsys.readouterr() == ("", told)
 
 
 def test_copies_have_the_rows_stages_and_a_fits_machine_code() -> None:
