@@ -61,13 +61,9 @@ def main(job: Job, params: Params) -> str:
                 scores = reading.read_view_scores(paths.metrics_csv, row)
                 if "psnr" not in scores:
                     unscored[scene, row.id] = reading.why_unscored(metrics, row)
-                if row.id in ("unaveraged", "derain", "loop"):
-                    scores |= reading.mask_scores(metrics)
-                for name, value in scores.items():
+                for name, value in (scores | reading.mask_scores(metrics, row)).items():
                     found[scene, row.id, name][seed] = value
-                for name, value in (
-                    reading.gathered_scores(metrics).items() if row.id == "loop" else ()
-                ):
+                for name, value in reading.gathered_scores(metrics, row).items():
                     found[scene, "gathered", name][seed] = value
     if not poses:
         raise UserError("No row of the comparison has metrics yet.", "Run `make tables` first.")

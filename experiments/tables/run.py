@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from experiments.command import sentences
 from experiments.tables.warm import serving
-from pipeline.errors import UserError
 from pipeline.parallel import cores
 from pipeline.params import read_params
 
@@ -178,11 +178,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=PROFILES)
     folder = HERE / parser.parse_args().profile
-    try:
+    with sentences():
         read_params(folder / "params.yaml")
-    except UserError as error:
-        print(f"{error.what}\n  {error.hint}", file=sys.stderr)
-        return 2
     command = _dvc("stage", "list", "--all", "--name-only")
     listed = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     if listed.returncode:

@@ -15,6 +15,7 @@ from pipeline.tables.rows import Row
 from pipeline.tables.statistics import mean
 
 NUMBERS = ("psnr", "ssim", "flip", "lpips")
+MASKED = ("unaveraged", "derain", "loop")  # by their ids: the rows whose masks are drawn
 MASKS = ("precision", "recall", "iou")
 
 
@@ -62,14 +63,14 @@ def why_unscored(metrics: Mapping[str, Any], row: Row) -> str:
     return f"not all of its images could be judged{some}{placed}"
 
 
-def mask_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Precision, recall and IoU of the masks that a row was fitted with, as far as they are known."""
-    return _known(metrics.get("masks", {}))
+def mask_scores(metrics: Mapping[str, Any], row: Row) -> dict[str, float]:
+    """Precision, recall and IoU of the masks that a row of its own masks was fitted with, as far as known."""
+    return _known(metrics.get("masks", {})) if row.id in MASKED else {}
 
 
-def gathered_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
+def gathered_scores(metrics: Mapping[str, Any], row: Row) -> dict[str, float]:
     """The same of the masks gathered on the glass, before the loop's first fit; empty without a loop."""
-    return _known(metrics.get("rounds", {}).get("0", {}))
+    return _known(metrics.get("rounds", {}).get("0", {})) if row.id == "loop" else {}
 
 
 def _known(numbers: Mapping[str, Any]) -> dict[str, float]:

@@ -253,7 +253,9 @@ def test_a_mistake_in_the_parameters_is_told_once(
     monkeypatch.setattr(run.signal, "signal", lambda number, how: None)
     monkeypatch.setattr(run.subprocess, "run", lambda *words, **how: pytest.fail("went on"))
     monkeypatch.setattr(sys, "argv", ["run", "tiny"])
-    assert run.main() == 2
+    with pytest.raises(SystemExit) as end:
+        run.main()
+    assert end.value.code == 2
     told = "params.yaml: unknown section: nerff. Did you mean nerf?\n  Correct it and run again.\n"
     assert capsys.readouterr() == ("", told)
 
