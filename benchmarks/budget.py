@@ -19,11 +19,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 
-from benchmarks.quality import FIELD, ROOT, ROWS, Scene, load, photos_of, psnr, seen_pixels
+from benchmarks.flags import rows_of, settings_of
+from benchmarks.quality import (
+    FIELD,
+    ROOT,
+    ROWS,
+    USED,
+    Scene,
+    fit_with,
+    load,
+    photos_of,
+    psnr,
+    seen_pixels,
+)
 from pipeline.field.buffer import RayBuffer
-from pipeline.field.fit import fit
 from pipeline.field.model import build_around
 from pipeline.field.render import RenderedView, render_view
 
@@ -61,8 +71,7 @@ def measure(
 
     def timed(model: Any, steps: int) -> float:
         begin = time.perf_counter()
-        fit(model, buffer, steps=steps, batch_rays=settings["batch_rays"], seed=settings["seed"],
-            rate=settings["rate"], average=settings["average"], threads=threads)  # fmt: skip
+        fit_with(settings, model, buffer, steps, threads)
         return time.perf_counter() - begin
 
     timed(copy.deepcopy(model), 2)  # compiles, or reads what was compiled
@@ -97,8 +106,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[2])
     parser.add_argument("--set", nargs="*", default=[], help="parameters of params.yaml, key=value")
     flags = parser.parse_args()
-    settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
-    settings |= {pair.split("=")[0]: yaml.safe_load(pair.split("=")[1]) for pair in flags.set}
+    settings, rows = settings_of(parser, flags.set, USED), rows_of(parser, flags.rows, ROWS)
     print(f"{'scene':14} {'row':12} {'threads':>7} {'steps':>6} {'fit s':>7} {'rays/s':>9} "
           f"{'PSNR':>6} {'gap':>6} {'seen':>6} {'gap':>6} {'s/view':>7}", flush=True)  # fmt: skip
     for folder in flags.scenes:
@@ -107,7 +115,7 @@ def main() -> None:
         for threads in flags.threads:
             for seconds in flags.seconds:
                 clean, steps = (np.nan, np.nan), 0
-                for row in flags.rows.split(","):
+                for row in rows:
                     out = measure(scene, row, seconds, threads, settings, seen, steps)
                     steps = out.steps  # of the rows after it too: the gap is the drops'
                     clean = (out.psnr, out.seen) if row == "clean" else clean

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-import yaml
 
+from benchmarks.flags import rows_of, settings_of
 from pipeline.field.buffer import PosedPhoto, RayBuffer
 from pipeline.field.fit import fit
 from pipeline.field.model import build_around
@@ -69,6 +69,8 @@ FIELD = (
     "space",
     "precision",
 )
+FITTED = ("batch_rays", "seed", "rate", "exposure", "average", "shards")
+USED = (*dict.fromkeys(FIELD + FITTED), "near_factor", "far_factor")
 
 
 @dataclass(frozen=True)
@@ -193,6 +195,13 @@ def photos_of(
     return photos, held_out, near, far
 
 
+def fit_with(
+    settings: dict[str, Any], model: Any, buffer: RayBuffer, steps: int, threads: int
+) -> None:
+    """Fits the model in place as the section nerf says."""
+    fit(model, buffer, steps=steps, threads=threads, **{key: settings[key] for key in FITTED})
+
+
 def measure(
     scene: Scene,
     row: str,
@@ -208,13 +217,11 @@ def measure(
     config = {key: settings[key] for key in FIELD}
     model = build_around("fast", list(views.values()), near, far, device=device, **config)
     buffer = RayBuffer(photos, settings["seed"], device)
-    if device == "cpu":  # the first fit of a process compiles, or reads what was compiled
-        fit(copy.deepcopy(model), buffer, steps=2, batch_rays=64, seed=0, threads=threads)
+    # The first fit of a process compiles, or reads what was compiled; on a GPU its libraries are loaded by it.
+    fit(copy.deepcopy(model), buffer, steps=2, batch_rays=64, seed=0, threads=threads)
     clock = time.process_time if device == "cpu" else time.perf_counter
     begin = clock()
-    fit(model, buffer, steps=settings["steps"], batch_rays=settings["batch_rays"],
-        seed=settings["seed"], rate=settings["rate"], exposure=settings["exposure"],
-        average=settings["average"], threads=threads)  # fmt: skip
+    fit_with(settings, model, buffer, settings["steps"], threads)
     seconds = clock() - begin
     torch.set_num_threads(threads)
     renders = {}
@@ -272,8 +279,8 @@ def main() -> None:
     parser.add_argument("--shrink", type=int, default=1, help="photos so many times smaller")
     parser.add_argument("--set", nargs="*", default=[], help="other parameters, key=value")
     flags = parser.parse_args()
-    settings = yaml.safe_load((ROOT / "params.yaml").read_text())["nerf"]
-    settings |= {pair.split("=")[0]: yaml.safe_load(pair.split("=")[1]) for pair in flags.set}
+    settings = settings_of(parser, flags.set, (*USED, "steps"))
+    rows = rows_of(parser, flags.rows, ROWS)
     settings["steps"] = flags.steps or settings["steps"]
     for folder in flags.scenes:
         scene = shrunk(load(folder, flags.artifacts / folder.name), flags.shrink)
@@ -284,7 +291,7 @@ def main() -> None:
               f"{'gap':>6} {'cpu s' if flags.device == 'cpu' else 's':>6}", flush=True)  # fmt: skip
         seen = seen_pixels(scene, {}) if scene.depth else {}
         clean: dict[str, Result] = {}
-        for row in flags.rows.split(","):
+        for row in rows:
             kind, masks, poses = ROWS[row]
             if poses not in scene.views or not scene.drawn.get(masks, True):
                 continue

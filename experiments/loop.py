@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.command import sentences
+from pipeline.errors import UserError
 from pipeline.evaluation.masks import mask_counts, mask_scores
 from pipeline.evaluation.references import find_references, read_reference
 from pipeline.evaluation.rounds import score_rounds
@@ -63,7 +65,7 @@ def table(root: Path, scene: str, covered: float = COVERED) -> list[str]:
     return [*lines, f"| {scene} | ended: {about['why']} |"]
 
 
-def picture(root: Path, scene: str) -> np.ndarray:
+def picture(root: Path, scene: str, covered: float = COVERED) -> np.ndarray:
     """(H, 2W, 3): the middle photo, and again with what the mask found, marked too much, and missed."""
     paths = ScenePaths(root, scene)
     records = read_images_json(paths.images)
@@ -71,7 +73,11 @@ def picture(root: Path, scene: str) -> np.ndarray:
     photo = read_image(paths.images / record.name)
     drop_mask = ~read_keep_mask(paths.refine / record.name, record.size)
     covers = find_references(paths.truth / "coverage", [record]) or {}
-    true = read_reference(covers[record.name], record, paths.data / record.source)[..., 0] > COVERED
+    if record.name not in covers:
+        raise UserError(
+            f"{paths.truth / 'coverage'} has nothing of {record.name}.", "No --picture."
+        )
+    true = read_reference(covers[record.name], record, paths.data / record.source)[..., 0] > covered
     marked = photo.copy()
     for where, colour in (
         (drop_mask & true, FOUND), (drop_mask & ~true, TOO_MUCH), (~drop_mask & true, MISSED),
@@ -87,6 +93,7 @@ def _line(scene: str, what: str, numbers: dict[str, float], glass: str) -> str:
     return f"| {scene} | {what} | {' | '.join(cells)} | {psnr} | {glass} |"
 
 
+@sentences()
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -105,11 +112,13 @@ def main() -> None:
     for scene in flags.scenes:
         if flags.run:
             command = [sys.executable, "-m", "stages.refine", "--scene", scene]
-            subprocess.run([*command, "--params", str(flags.params)], check=True)
+            done = subprocess.run([*command, "--params", str(flags.params)])
+            if done.returncode:
+                sys.exit(done.returncode)  # the stage has said why
         print("\n".join(table(flags.params.resolve().parent, scene, flags.covered)), flush=True)
     if flags.picture:
         root = flags.params.resolve().parent
-        rows = [as_bytes(picture(root, scene)) for scene in flags.scenes]
+        rows = [as_bytes(picture(root, scene, flags.covered)) for scene in flags.scenes]
         write_image(flags.picture, np.concatenate(rows))
 
 

@@ -17,10 +17,9 @@ from pipeline.io.masks import read_keep_mask
 from pipeline.io.paths import ScenePaths
 from pipeline.io.scene import read_images_json
 from pipeline.stage import Job, Section, run
-from pipeline.tables import compose
+from pipeline.tables import compose, reading
 from pipeline.tables.crops import busiest_window, side_by_side
-from pipeline.tables.reading import gathered_scores, mask_scores, read_view_scores
-from pipeline.tables.rows import ROWS, Row
+from pipeline.tables.rows import ROWS
 from pipeline.tables.settings import noted
 from pipeline.tables.writers import as_csv, latex, markdown
 
@@ -44,6 +43,7 @@ def main(job: Job, params: Params) -> str:
     """Makes `tables/`: each table as Markdown, CSV and LaTeX, and one strip of crops per scene."""
     found: dict[tuple[str, str, str], dict[int, float]] = defaultdict(dict)
     missing: dict[tuple[str, str], str] = {}
+    unscored: dict[tuple[str, str], str] = {}
     poses, conventions, made = {}, {}, {}
     for scene in params.scenes:
         for row in ROWS:
@@ -52,27 +52,29 @@ def main(job: Job, params: Params) -> str:
                 paths = ScenePaths(job.root, scene, f"{row.key}-{seed}" if row.seeded else row.key)
                 if not paths.metrics.is_file():
                     lacking.append(seed)
-                    missing[scene, row.id] = _why(row, scene, params, lacking)
+                    some = lacking if row.seeded and lacking != params.seeds else []
+                    missing[scene, row.id] = reading.why_missing(row, some, scene in params.lens)
                     continue
                 metrics = read_metrics(paths.metrics)
                 made[scene, row.key, seed] = paths.metrics
                 poses[scene], conventions = metrics["poses"], metrics["conventions"]
-                scores = read_view_scores(paths.metrics_csv, row)
-                if row.id in ("unaveraged", "derain", "loop"):
-                    scores |= mask_scores(metrics)
-                for name, value in scores.items():
+                scores = reading.read_view_scores(paths.metrics_csv, row)
+                if "psnr" not in scores:
+                    unscored[scene, row.id] = reading.why_unscored(metrics, row)
+                for name, value in (scores | reading.mask_scores(metrics, row)).items():
                     found[scene, row.id, name][seed] = value
-                for name, value in gathered_scores(metrics).items() if row.id == "loop" else ():
+                for name, value in reading.gathered_scores(metrics, row).items():
                     found[scene, "gathered", name][seed] = value
     if not poses:
         raise UserError("No row of the comparison has metrics yet.", "Run `make tables` first.")
     told = [*params.notes, *(f"{name}: {conventions[name]}." for name in ("psnr", "ssim", "flip"))]
     told.append(compose.lpips_note(found, str(conventions["lpips_net"])))
+    gaps = missing | unscored
     tables = [
-        compose.comparison(found, params.scenes, missing, told),
+        compose.comparison(found, params.scenes, gaps, told),
         compose.paper_comparison(),
-        compose.gains(found, params.scenes, missing),
-        compose.ablation(found, params.lens, missing),
+        compose.gains(found, params.scenes, gaps),
+        compose.ablation(found, params.lens, gaps),
         compose.mask_quality(found, params.scenes, missing, float(conventions["mask_threshold"])),
         compose.pose_quality(poses, params.scenes),
     ]
@@ -86,21 +88,17 @@ def main(job: Job, params: Params) -> str:
         for scene in params.scenes:
             _strip(ScenePaths(job.root, scene), params.seeds[0], fresh / f"{scene}.png")
     runs = sum(len(values) for (_, _, name), values in found.items() if name == "psnr")
-    return f"{runs} scores, {len(missing)} cells without all of their runs, in {job.paths.tables}"
-
-
-def _why(row: Row, scene: str, params: Params, lacking: list[int]) -> str:
-    if row.key == "unaveraged" and scene not in params.lens:
-        return "equation 5 is for drops on the lens; without it the masks are those of the next row"
-    some = row.seeded and lacking != params.seeds
-    return "not computed" + (f" for seed {', '.join(map(str, lacking))}" if some else "")
+    return f"{runs} scores, {len(gaps)} cells without all of their runs, in {job.paths.tables}"
 
 
 def _strip(paths: ScenePaths, seed: int, out: Path) -> None:
-    """The held-out view with the most water, there where it is."""
+    """The held-out view with the most water, there where it is; nothing where there is no such view."""
     small = paths.small
-    records = [r for r in read_images_json(small / "images") if r.split == "test"]
-    water = {r.name: ~read_keep_mask(small / "true" / r.name, r.size) for r in records}
+    records = read_images_json(small / "images") if small.is_dir() else []
+    held_out = [record for record in records if record.split == "test"]
+    water = {r.name: ~read_keep_mask(small / "true" / r.name, r.size) for r in held_out}
+    if not water:
+        return
     name = max(water, key=lambda one: float(water[one].mean()))
     size = (water[name].shape[1] // 2, water[name].shape[0] // 2)
     corner = busiest_window(water[name].astype(np.float32), size)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ast
 import functools
+import hashlib
+import json
 import subprocess
 import sys
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +81,34 @@ def test_dvc_lists_the_parameters_that_a_stage_reads(name: str) -> None:
 def test_the_wet_scenes_follow_the_code_that_renders_them() -> None:
     """`synthesize` can do more, paint on photos that lie anywhere; these scenes are ray traced."""
     content = yaml.safe_load((ROOT / "experiments/scenes/dvc.yaml").read_text())
-    deps = {dep.removeprefix("../../") for dep in content["stages"]["scene"]["do"]["deps"]}
+    deps = {dep.removeprefix(".code/") for dep in content["stages"]["scene"]["do"]["deps"]}
     assert {"stages/synthesize.py", "pipeline/drops", *_code("pipeline.drops.storing")} <= deps
+
+
+def _md5(path: Path) -> str:
+    """What DVC writes down of a file or folder, without what .dvcignore names."""
+    if path.is_file():
+        return hashlib.md5(path.read_bytes()).hexdigest()
+    files = [one for one in path.rglob("*.*") if one.is_file() and one.suffix != ".pyc"]
+    listed = [
+        {"md5": _md5(one), "relpath": one.relative_to(path).as_posix()}
+        for one in files
+        if "__pycache__" not in one.parts
+    ]
+    text = json.dumps(sorted(listed, key=itemgetter("relpath")), sort_keys=True)
+    return f"{hashlib.md5(text.encode()).hexdigest()}.dir"
+
+
+def test_the_wet_scenes_lock_file_is_of_the_code_and_parameters_as_they_are() -> None:
+    """Else all are rendered anew wherever the comparison is made. CONTRIBUTING.md says how to renew it."""
+    folder = ROOT / "experiments/scenes"
+    params = yaml.safe_load((folder / "params.yaml").read_text())
+    for name, entry in yaml.safe_load((folder / "dvc.lock").read_text())["stages"].items():
+        for dep in entry["deps"]:
+            assert dep["md5"] == _md5(folder / dep["path"]), f"{name}: {dep['path']} has changed"
+        for key, value in entry["params"]["params.yaml"].items():
+            now = functools.reduce(lambda values, part: values[part], key.split("."), params)
+            assert value == now, f"{name}: {key} has changed"
 
 
 def test_the_page_follows_the_numbers_that_it_shows() -> None:

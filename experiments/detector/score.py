@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import torch
 
+from experiments.command import sentences
 from pipeline.attention.inference import attend
 from pipeline.attention.pools import (
     CHUNK,
@@ -36,6 +37,7 @@ from pipeline.attention.pools import (
 )  # fmt: skip
 from pipeline.attention.samples import VISIBLE_COVERAGE, coverage_of_pair
 from pipeline.attention.weights import Detector, load_network
+from pipeline.errors import UserError
 from pipeline.io.images import PHOTO_SUFFIXES, read_photo, shrink
 
 BINS = 1000
@@ -133,10 +135,13 @@ def _unit(photo: np.ndarray) -> np.ndarray:
 
 def named_detector(name: str) -> Detector:
     """The detector that MODEL:FILE names, ready for inference."""
-    model, file = name.split(":", 1)
+    model, colon, file = name.partition(":")
+    if not colon:
+        raise UserError(f"{name} names no detector.", "Write MODEL:FILE.")
     return load_network(Path(file), model).for_inference()
 
 
+@sentences()
 def main() -> None:
     """Reads the command line and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -153,6 +158,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--scratch", type=Path, default=Path("artifacts/.work/demo/train_detector"))
     flags = parser.parse_args()
+    if not 0 <= flags.threshold < 1:
+        parser.error(f"--threshold {flags.threshold:g} is not in [0, 1)")
     with_mirror = ", mirrored" * flags.mirrored
     print(f"threshold {flags.threshold:g}, scales {flags.scales}{with_mirror}")
     for detector in flags.detectors:

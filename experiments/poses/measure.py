@@ -26,6 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from experiments.command import sentences
 from pipeline.drops.synthesis import painted
 from pipeline.errors import UserError
 from pipeline.geometry.poses import pose_errors
@@ -50,6 +51,7 @@ WAYS = {
     "true": replace(PLAIN, masked=True),
     "retried": replace(PLAIN, masked=True),
 }
+REFERENCE = "plain"  # of dry photos, where there is no truth
 Poses = dict[str, np.ndarray]
 
 
@@ -205,7 +207,7 @@ def _cases(demo: Path | None, scenes: list[Path], photos: Path | None, out: Path
         focal = _brought_in(photos, dry)
         clean = Case(photos.parent.name, dry, {}, focal, None)
         yield clean
-        reference = json.loads((out / f"{clean.name}-plain.json").read_text())["poses"]
+        reference = json.loads((out / f"{clean.name}-{REFERENCE}.json").read_text())["poses"]
         truth = {name: np.array(pose) for name, pose in reference.items()}
         yield from (_wetted(replace(clean, truth=truth), coverage) for coverage in HEAVY)
 
@@ -235,6 +237,7 @@ def _keep(file: Path, row: dict[str, object], poses: Poses, truth: Poses | None)
     print(json.dumps(row), flush=True)
 
 
+@sentences()
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -250,6 +253,10 @@ def main() -> None:
     if flags.table:
         print(table(flags.out))
         return
+    if flags.photos and REFERENCE not in flags.ways:
+        reference = flags.out / f"{flags.photos.parent.name}-{REFERENCE}.json"
+        if not reference.is_file():
+            parser.error(f"--photos: {reference} stands for the truth; add {REFERENCE} to --ways")
     for case in _cases(flags.demo, flags.scenes, flags.photos, flags.out):
         for way in flags.ways:
             file = flags.out / f"{case.name}-{way}.json"

@@ -22,9 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor, nn
 
+from experiments.command import sentences
 from experiments.detector.score import aligned
 from pipeline.attention import pools
 from pipeline.attention.samples import VISIBLE_COVERAGE, coverage_of_pair
+from pipeline.errors import UserError
 from pipeline.evaluation.flip import flip
 from pipeline.evaluation.image import psnr, ssim
 from pipeline.io.images import read_photo, write_image
@@ -106,6 +108,7 @@ def figures(found: np.ndarray, case: Case) -> list[float]:
     return [whole, ssim(found, case.clean), flip(found, case.clean), wet, dry]
 
 
+@sentences()
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -121,6 +124,8 @@ def main() -> None:
     parser.add_argument("--plain", action="store_true", help="wen: all pixels from the network")
     parser.add_argument("--out", type=Path, required=True)
     flags = parser.parse_args()
+    if not (flags.scenes or flags.photos or flags.pairs):
+        parser.error("there is nothing to score: name --scenes, --photos or --pairs")
     weights = flags.weights or Path(f"weights/removers/{flags.method}.safetensors")
     cases = [scene_cases(folder) for folder in flags.scenes]
     if flags.photos:
@@ -137,6 +142,10 @@ def main() -> None:
         lines.append([case.group, case.name, *(round(value, 4) for value in row)])
         write_image(
             flags.out / f"{case.group}-{case.name}.png", np.hstack([rainy, done, case.clean])
+        )
+    if not lines:
+        raise UserError(
+            "No picture of these sets can be scored.", "See the names that --help tells."
         )
     heading = ["set", "picture", *(f"rainy_{name}" for name in FIGURES), *FIGURES]
     with (flags.out / "scores.csv").open("w", newline="") as file:

@@ -9,11 +9,11 @@ and from another.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import cv2
 import numpy as np
 
+from experiments.command import picture, write_picture
 from experiments.scenes.measure import recipes
 from pipeline.drops import mitsuba_scene, places, synthesis
 from pipeline.drops.creep import crept
@@ -108,12 +108,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("out", type=Path)
+    parser.add_argument("out", type=picture)
     out = parser.parse_args().out
     parts = panels()
     rows = [np.hstack(parts[k : k + 4]) for k in range(0, len(parts), 4)]
     sheet = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
-    cv2.imwrite(str(out), sheet, [cv2.IMWRITE_JPEG_QUALITY, 78])
+    write_picture(out, sheet, 78)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from experiments.command import picture, write_picture
 from pipeline.io.maps import read_depth
 
 
@@ -35,6 +36,6 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data", type=Path, help="a scene's folder, with its truth")
-    parser.add_argument("out", type=Path)
+    parser.add_argument("out", type=picture)
     flags = parser.parse_args()
-    cv2.imwrite(str(flags.out), sheet(flags.data), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    write_picture(flags.out, sheet(flags.data), 85)

@@ -6,11 +6,13 @@ What is done once per scene loads itself.
 from __future__ import annotations
 
 import importlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.errors import UserError
 from pipeline.field.buffer import PosedPhoto, RayBuffer
 from pipeline.field.fit import fit
 from pipeline.field.model import build_around
@@ -39,4 +41,5 @@ def _tiny() -> None:
 for stage in STAGES:
     importlib.import_module(f"stages.{stage}")
 _tiny()
-read_params(Path(__file__).with_name("params.yaml"))
+with suppress(UserError):  # the stages tell it
+    read_params(Path(__file__).with_name("params.yaml"))

@@ -70,7 +70,10 @@ def main() -> None:
     """Reads the command line and writes the documents."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=("quick", "full"))
-    tables = HERE / parser.parse_args().profile / "tables"
+    profile = parser.parse_args().profile
+    tables = HERE / profile / "tables"
+    if not tables.is_dir():
+        parser.error(f"{tables} does not exist: run `make tables PROFILE={profile}` first")
     for file in sorted(tables.iterdir()):
         if file.suffix == ".png":
             with Image.open(file) as strip:

@@ -20,8 +20,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from experiments.command import sentences
 from experiments.tables.warm import serving
 from pipeline.parallel import cores
+from pipeline.params import read_params
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -169,11 +171,15 @@ def _make(folder: Path, waiting: list[Share], table: Callable[[str, bool], None]
 
 
 def main() -> int:
-    """Makes every row; 1 when anything could not be made, be it a row that the tables then miss."""
+    """Makes every row; 1 when anything could not be made, be it a row that the tables then miss, 2 when the
+    parameters are at fault.
+    """
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("profile", choices=PROFILES)
     folder = HERE / parser.parse_args().profile
+    with sentences():
+        read_params(folder / "params.yaml")
     command = _dvc("stage", "list", "--all", "--name-only")
     listed = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     if listed.returncode:

@@ -3,7 +3,8 @@
     python -m experiments.tables.steps nerf render evaluate --scene street --variant nerf-0
 
 runs them one after the other, each as `python -m stages.NAME` would, and stops at the first that fails.
-Where STEPS_ADDRESS is the address of :mod:`experiments.tables.warm`, it asks there for a process.
+Where STEPS_ADDRESS is the address of :mod:`experiments.tables.warm`, it asks there for a process, unless code
+was changed since that began: DVC writes down the code that lies there now, so that must be the one that runs.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from collections.abc import Sequence
 from multiprocessing.connection import Client
 from pathlib import Path
 
-ADDRESS = "STEPS_ADDRESS"
+from pipeline.io.code import code_key
+
+ADDRESS, CODE = "STEPS_ADDRESS", "STEPS_CODE"
 
 
 def main(words: Sequence[str]) -> int:
     """Runs the stages named before the first flag, here or where they are loaded; the exit code."""
-    if ADDRESS not in os.environ:
+    if ADDRESS not in os.environ or os.environ.get(CODE) != code_of_stages():
         return run_stages(words)
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
     try:
@@ -30,6 +33,11 @@ def main(words: Sequence[str]) -> int:
             return code
     except (EOFError, OSError):
         return 1  # whoever ordered the work has ended
+
+
+def code_of_stages() -> str:
+    """A digest of all code that stages can run."""
+    return code_key(".", "../stages")
 
 
 def run_stages(words: Sequence[str]) -> int:

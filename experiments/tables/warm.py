@@ -17,7 +17,7 @@ from multiprocessing.connection import Client, Connection, Listener, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from experiments.tables.steps import ADDRESS, run_stages
+from experiments.tables.steps import ADDRESS, CODE, code_of_stages, run_stages
 
 LOADED = ["experiments.tables.loaded"]
 MOST = 64  # that may ask at the same moment
@@ -32,6 +32,7 @@ def serving() -> Iterator[dict[str, str]]:
 
     The process that is copied has the environment of this one, and ends with it; so do the copies.
     """
+    code = code_of_stages()  # before it is loaded
     multiprocessing.get_context("forkserver").set_forkserver_preload(LOADED)
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -40,7 +41,7 @@ def serving() -> Iterator[dict[str, str]]:
         guard = threading.Thread(target=_let_in, args=(door,), daemon=True)
         guard.start()
         try:
-            yield {ADDRESS: str(door.address)}
+            yield {ADDRESS: str(door.address), CODE: code}
         finally:
             with suppress(OSError), Client(door.address) as last:  # the guard waits for somebody
                 last.send(None)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.io.accounts import judged
 from pipeline.tables.rows import Row
 from pipeline.tables.statistics import mean
 
 NUMBERS = ("psnr", "ssim", "flip", "lpips")
+MASKED = ("unaveraged", "derain", "loop")  # by their ids: the rows whose masks are drawn
 MASKS = ("precision", "recall", "iou")
 
 
@@ -43,14 +45,32 @@ def view_scores(text: str, row: Row) -> dict[str, float]:
     return scores
 
 
-def mask_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Precision, recall and IoU of the masks that a row was fitted with, as far as they are known."""
-    return _known(metrics.get("masks", {}))
+def why_missing(row: Row, seeds: Sequence[int], on_lens: bool) -> str:
+    """Why a row of a scene has no metrics: for some of its `seeds`, or, without any named, for none at all."""
+    if row.key == "unaveraged" and not on_lens:
+        return "equation 5 is for drops on the lens; without it the masks are those of the next row"
+    return "not computed" + (f" for seed {', '.join(map(str, seeds))}" if seeds else "")
 
 
-def gathered_scores(metrics: Mapping[str, Any]) -> dict[str, float]:
+def why_unscored(metrics: Mapping[str, Any], row: Row) -> str:
+    """Why a row that has metrics is without numbers in the tables: a mean over some images alone is none."""
+    poses, reason = metrics["poses"], metrics.get(row.kind, {}).get("psnr_reason")
+    if reason:
+        return str(reason)
+    some = judged(metrics) if row.kind == "test" else ""
+    lost = poses["registered"] < poses["total"]
+    placed = f"; {poses['registered']} of {poses['total']} photos have a pose" if lost else ""
+    return f"not all of its images could be judged{some}{placed}"
+
+
+def mask_scores(metrics: Mapping[str, Any], row: Row) -> dict[str, float]:
+    """Precision, recall and IoU of the masks that a row of its own masks was fitted with, as far as known."""
+    return _known(metrics.get("masks", {})) if row.id in MASKED else {}
+
+
+def gathered_scores(metrics: Mapping[str, Any], row: Row) -> dict[str, float]:
     """The same of the masks gathered on the glass, before the loop's first fit; empty without a loop."""
-    return _known(metrics.get("rounds", {}).get("0", {}))
+    return _known(metrics.get("rounds", {}).get("0", {})) if row.id == "loop" else {}
 
 
 def _known(numbers: Mapping[str, Any]) -> dict[str, float]:

@@ -16,7 +16,7 @@ from pipeline.tables.layout import Table
 from pipeline.tables.rows import ROWS, Row
 
 Run = tuple[str, str, int]  # scene, row's key, seed
-LOCK = "dvc.lock"
+LOCK, CODE = "dvc.lock", ".code/"
 PAUSE, PATIENCE = 0.5, 60  # seconds between two looks at the lock file, and how many looks
 
 
@@ -77,7 +77,7 @@ def _settled(locks: Sequence[Path]) -> list[bytes]:
 
 
 def _made_from(entry: Mapping[str, Any]) -> dict[str, Any]:
-    made = {dep["path"]: dep.get("md5") for dep in entry.get("deps", ())}
+    made = {dep["path"].removeprefix(CODE): dep.get("md5") for dep in entry.get("deps", ())}
     for file, sections in entry.get("params", {}).items():
         made |= {f"{name} of {file}": value for name, value in sections.items()}
     return made

@@ -43,7 +43,7 @@ PROGRAMS = ("sh", "bash", "env", "dirname", "grep", "uname")
 
 def copy_project(root: Path) -> None:
     """The project without its repository, data and results, with the scene `tiny` as its only one."""
-    shutil.copytree(ROOT, root, ignore=LEFT_BEHIND)
+    shutil.copytree(ROOT, root, ignore=LEFT_BEHIND, symlinks=True)
     photograph(root / "data" / SCENE)
     write_small_params(root)
 

@@ -1,7 +1,10 @@
-"""What benchmarks measure: a scene of smaller photos is the same scene, and compiling is no part of a fit."""
+"""What benchmarks measure: a scene of smaller photos is the same scene, compiling is no part of a fit, and
+what the command line asks for is what is fitted.
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
 from dataclasses import replace
 from typing import Any
@@ -12,6 +15,7 @@ import torch
 import yaml
 
 from benchmarks import budget, field, quality
+from benchmarks.flags import rows_of, settings_of
 from benchmarks.quality import Scene, seen_pixels, shrunk
 from pipeline.geometry.rays import pixel_rays
 from pipeline.io.transforms import View
@@ -109,7 +113,7 @@ def test_a_fit_is_as_long_as_its_seconds_allow(monkeypatch: pytest.MonkeyPatch) 
     def costs(model: Any, buffer: Any, *, steps: int, **how: Any) -> None:
         clock[0] += 0.25 * steps
 
-    monkeypatch.setattr(budget, "fit", costs)
+    monkeypatch.setattr(quality, "fit", costs)
     monkeypatch.setattr(budget.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
     settings = yaml.safe_load((quality.ROOT / "params.yaml").read_text())["nerf"]
@@ -118,3 +122,40 @@ def test_a_fit_is_as_long_as_its_seconds_allow(monkeypatch: pytest.MonkeyPatch) 
     row = budget.measure(wall, "clean", 60.0, 1, settings, seen_pixels(wall, {}))
     assert (row.steps, row.seconds) == (240, 60.0)
     assert row.psnr == pytest.approx(row.seen) and np.isfinite(row.psnr)
+
+
+def test_what_is_set_reaches_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+    monkeypatch.setattr(quality, "fit", lambda model, buffer, **how: asked.update(how))
+    pairs = ["shards=1", "exposure=true", "rate=3e-1"]
+    settings = settings_of(argparse.ArgumentParser(), pairs, quality.USED)
+    quality.fit_with(settings, None, None, 7, 2)  # type: ignore[arg-type]
+    assert asked["steps"] == 7 and asked["rate"] == 0.3
+    assert (asked["shards"], asked["exposure"]) == (1, True)
+    used = {*quality.FIELD, *asked, "near_factor", "far_factor"} - {"steps", "threads"}
+    assert used == set(quality.USED)
+
+
+@pytest.mark.parametrize(
+    "pair, told",
+    [
+        ("sampels=12", "has no sampels"),
+        ("paper_steps=12", "paper_steps has no effect here"),
+        ("samples", "write KEY=VALUE"),
+        ("samples=many", "nerf.samples: Input should be"),
+        ("samples=[", "is no value"),
+    ],
+)
+def test_what_cannot_be_set_is_refused(
+    pair: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        settings_of(argparse.ArgumentParser(), [pair], quality.USED)
+    assert end.value.code == 2 and told in capsys.readouterr().err
+
+
+def test_rows_that_there_are_not_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert rows_of(argparse.ArgumentParser(), "true,clean", quality.ROWS) == ["true", "clean"]
+    with pytest.raises(SystemExit):
+        rows_of(argparse.ArgumentParser(), "true,cleen", quality.ROWS)
+    assert "there is no row 'cleen'; there are clean, clean-masked" in capsys.readouterr().err

@@ -21,13 +21,15 @@ from pipeline.params import read_folders, read_params, read_section, stage_names
 from pipeline.tables.rows import ROWS
 from tests.test_architecture import true_code_dependencies
 
-TABLES = Path(__file__).resolve().parents[2] / "experiments/tables"
+ROOT = Path(__file__).resolve().parents[2]
+SCENES, TABLES = ROOT / "experiments/scenes", ROOT / "experiments/tables"
 DAG: dict[str, dict[str, Any]] = {
     name: entry
     for file in ("stages.yaml", "table.yaml")
     for name, entry in yaml.safe_load((TABLES / file).read_text())["stages"].items()
 }
 UP = "../../../"
+CODE = ".code/"
 
 
 def stages_of(entry: dict[str, Any]) -> set[str]:
@@ -47,17 +49,32 @@ def test_code_dependencies_are_what_the_stages_import(name: str) -> None:
     code = {f"stages/{stage}.py" for stage in stages}
     code |= {path for stage in stages for path in true_code_dependencies(stage)}
     code = {"pipeline/io" if path.startswith("pipeline/io/") else path for path in code}
-    listed = {dep.removeprefix(UP) for dep in DAG[name]["deps"] if dep.startswith(UP)}
-    assert {path for path in listed if path.startswith(("pipeline/", "stages/"))} == code
+    listed = {dep.removeprefix(CODE) for dep in DAG[name]["deps"] if dep.startswith(CODE)}
+    assert listed == code
 
 
+@pytest.mark.parametrize("folder", [SCENES, *(TABLES / profile for profile in PROFILES)])
+def test_folders_are_followed_from_within_the_repository(folder: Path) -> None:
+    """Of a folder outside DVC would follow caches too: a repository's .dvcignore ends with it."""
+    scenes = yaml.safe_load((SCENES / "dvc.yaml").read_text())["stages"]["scene"]["do"]
+    for dep in {dep for entry in (scenes, *DAG.values()) for dep in entry["deps"]}:
+        assert not dep.startswith("../") or Path(dep).suffix, f"{dep}: a folder"
+    for name in ("pipeline", "stages"):
+        assert (folder / CODE / name).readlink().parts[0] == ".."
+        assert (folder / CODE / name).resolve() == ROOT / name
+    assert "__pycache__" in (folder / ".dvcignore").read_text().split("\n")
+
+
+@pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("name", DAG)
-def test_every_section_that_the_stages_read_is_followed(name: str) -> None:
+def test_every_section_that_the_stages_read_is_followed(name: str, profile: str) -> None:
     keys = {file: set(some) for entry in DAG[name]["params"] for file, some in entry.items()}
     assert keys[f"{UP}params.yaml"] == stages_of(DAG[name])
-    for file, place in (("../params.yaml", TABLES), ("params.yaml", TABLES / "quick")):
+    for file, place in (("../params.yaml", TABLES), ("params.yaml", TABLES / profile)):
         own = yaml.safe_load((place / "params.yaml").read_text())
         assert keys.get(file, set()) >= stages_of(DAG[name]) & set(own)
+    assert f"scenes.{'all' if name == 'table' else '${scene}'}" in keys["../params.yaml"]
+    assert not {"scenes", "variants"} & set(own), "a profile's own are not followed"
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -193,7 +210,8 @@ def test_stages_run_in_a_copy_end_as_they_would_here(
     monkeypatch.setattr(warm, "LOADED", ["pipeline.stage"])
     (tmp_path / "params.yaml").write_text("scenes: {a: {}}\nrefine: {rounds: many}\n")
     with warm.serving() as environment:
-        monkeypatch.setenv(steps.ADDRESS, environment[steps.ADDRESS])
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
         assert steps.main([]) == 0
         assert steps.main(["refine", "--scene", "a"]) == 2
         with Client(environment[steps.ADDRESS]):
@@ -202,6 +220,44 @@ def test_stages_run_in_a_copy_end_as_they_would_here(
             assert set(several.map(steps.main, [[]] * 40)) == {0}
     assert (tmp_path / "artifacts").exists() is False
     assert steps.main([]) == 1
+
+
+def test_after_a_change_of_the_code_stages_run_where_it_is_loaded_anew(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The copies are of what was loaded before: DVC would take their rows for the new code's."""
+    monkeypatch.setattr(warm, "LOADED", ["pipeline.stage"])
+    monkeypatch.setattr(steps, "run_stages", lambda words: 7)  # here; not in the copies
+    for folder in ("pipeline", "stages"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.py").write_text("before = 1\n")
+    monkeypatch.setattr("pipeline.io.code.PIPELINE", tmp_path / "pipeline")
+    with warm.serving() as environment:
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        assert steps.main([]) == 0
+        for folder in ("pipeline", "stages"):
+            file = tmp_path / folder / "a.py"
+            file.write_text("after = 1\n")
+            assert steps.main([]) == 7
+            file.write_text("before = 1\n")
+            assert steps.main([]) == 0
+
+
+def test_a_mistake_in_the_parameters_is_told_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny/params.yaml").write_text("nerff: {steps: 60}\n")
+    monkeypatch.setattr(run, "HERE", tmp_path)
+    monkeypatch.setattr(run.signal, "signal", lambda number, how: None)
+    monkeypatch.setattr(run.subprocess, "run", lambda *words, **how: pytest.fail("went on"))
+    monkeypatch.setattr(sys, "argv", ["run", "tiny"])
+    with pytest.raises(SystemExit) as end:
+        run.main()
+    assert end.value.code == 2
+    told = "params.yaml: unknown section: nerff. Did you mean nerf?\n  Correct it and run again.\n"
+    assert capsys.readouterr() == ("", told)
 
 
 def test_copies_have_the_rows_stages_and_a_fits_machine_code() -> None:

@@ -11,7 +11,7 @@ from pipeline.io.transforms import View
 from pipeline.tables import shrink
 from pipeline.tables.crops import GAP, LABEL_HEIGHT, busiest_window, side_by_side
 from pipeline.tables.reading import gathered_scores, mask_scores, read_view_scores, view_scores
-from pipeline.tables.rows import Row
+from pipeline.tables.rows import ROWS, Row
 
 
 def test_the_busiest_window_holds_the_most() -> None:
@@ -68,9 +68,13 @@ def test_scores_are_means_over_the_split() -> None:
 
 def test_mask_numbers() -> None:
     metrics = {"masks": {"iou": 0.5, "precision": None}, "rounds": {"0": {"iou": 0.25}}}
-    assert mask_scores(metrics) == {"iou": 0.5}
-    assert gathered_scores(metrics) == {"iou": 0.25}
-    assert gathered_scores({}) == {}
+    loop, derain, true = (
+        next(r for r in ROWS if r.id == key) for key in ("loop", "derain", "true")
+    )
+    assert mask_scores(metrics, loop) == mask_scores(metrics, derain) == {"iou": 0.5}
+    assert mask_scores(metrics, true) == {}, "the truth is not judged by itself"
+    assert gathered_scores(metrics, loop) == {"iou": 0.25}
+    assert gathered_scores({}, loop) == gathered_scores(metrics, derain) == {}
 
 
 @pytest.mark.parametrize("content", [None, b"rain\n1\n", b"split,test.psnr\ntest,wet\n", b"\xff"])

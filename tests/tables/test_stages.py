@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from pipeline.errors import UserError
 from pipeline.io.images import read_image, write_image
 from pipeline.io.masks import read_keep_mask
 from pipeline.io.paths import ScenePaths
-from pipeline.io.scene import read_images_json
+from pipeline.io.scene import read_images_json, write_images_json
 from pipeline.io.transforms import read_transforms
 from pipeline.stage import Job
 from pipeline.tables import settings
@@ -25,6 +26,8 @@ from tests.evaluation.fabricated import fabricate
 
 FOLDERS = {"images": "small/images", "poses": "small/poses", "refine": "small/true"}
 PARAMS = table.Params(title="Made", scenes=["made"], lens=["made"], seeds=[0, 1], notes=["Noted."])
+
+EVALUATE = evaluate.Params(lpips_backbone=None, coverage_threshold=0.05)
 
 
 def job(root: Path, variant: str | None = None) -> Job:
@@ -51,7 +54,7 @@ def row(root: Path, variant: str, step: int) -> None:
             clean = np.rint(read_image(paths.small / "clean" / record.name) * 255)
             off = np.where(clean > 127, clean - step, clean + step).astype(np.uint8)
             write_image(paths.views / "test" / record.name, off)
-    evaluate.main(job(root, variant), evaluate.Params(lpips_backbone=None, coverage_threshold=0.05))
+    evaluate.main(job(root, variant), EVALUATE)
 
 
 def test_the_small_scene_is_complete(paths: ScenePaths) -> None:
@@ -101,13 +104,57 @@ def test_tables_of_what_there_is(paths: ScenePaths, tmp_path: Path) -> None:
     )  # wet, NeRF, ours, clean: half the width, twice enlarged
 
 
+def test_a_scene_that_could_not_be_prepared_is_told_and_hinders_no_other(
+    paths: ScenePaths, tmp_path: Path
+) -> None:
+    """Neither one without anything nor one whose rows are there from before."""
+    row(tmp_path, "nerf-0", 8)
+    row(tmp_path, "nerf-1", 8)
+    shutil.copytree(paths.artifacts, tmp_path / "artifacts/stale")
+    shutil.rmtree(tmp_path / "artifacts/stale/small")
+    table.main(job(tmp_path), PARAMS.model_copy(update={"scenes": ["made", "room", "stale"]}))
+    made = tmp_path / "tables"
+    assert {file.name for file in made.glob("*.png")} == {"made.png"}
+    with (made / "comparison.csv").open() as file:
+        why = {(r["row"], r["group"]): r["missing"] for r in csv.DictReader(file)}
+    assert [why["NeRF", scene] for scene in ("made", "room", "stale")] == ["", "not computed", ""]
+
+
+def test_rows_that_are_not_judged_on_every_view_say_so(paths: ScenePaths, tmp_path: Path) -> None:
+    """A mean over other views than the other rows' would be none; the masks are known all the same."""
+    for seed in (0, 1):
+        row(tmp_path, f"derain-{seed}", 8)
+    held_out = sorted((job(tmp_path, "derain-1").paths.views / "test").iterdir())
+    held_out[0].unlink()
+    evaluate.main(job(tmp_path, "derain-1"), EVALUATE)
+    told = table.main(job(tmp_path), PARAMS)
+    text = (tmp_path / "tables/tables.md").read_text()
+    why = f"not all of its images could be judged (1 of {len(held_out)})"
+    assert len(held_out) == 2 and told.startswith("1 scores")
+    sections = {part.split("\n")[0]: part for part in text.split("\n## ")[1:]}
+    assert f"DerainNeRF, as in the paper, made: {why}." in text
+    masks = sections["Masks against the true coverage"]
+    assert "as drawn" in masks and why not in masks
+
+
+def test_without_held_out_views_no_strip(paths: ScenePaths, tmp_path: Path) -> None:
+    row(tmp_path, "nerf-0", 8)
+    for folder in (paths.images, paths.small / "images"):
+        records = [replace(record, split="train") for record in read_images_json(folder)]
+        write_images_json(folder, records)
+    evaluate.main(job(tmp_path, "nerf-0"), EVALUATE)
+    table.main(job(tmp_path), PARAMS)
+    assert not (tmp_path / "tables/made.png").exists()
+    assert "no held-out view was rendered" in (tmp_path / "tables/comparison.csv").read_text()
+
+
 def _locked(root: Path, steps: dict[str, int], code: dict[str, str]) -> None:
     """What DVC writes down of the rows' fits, as far as the tables read it."""
     entries = {
         f"fit@made-{name}": {
             "cmd": "fit",
             "deps": [
-                {"path": "../pipeline/field", "md5": code.get(name, "1.dir")},
+                {"path": ".code/pipeline/field", "md5": code.get(name, "1.dir")},
                 {"path": f"artifacts/made/{name}/own", "md5": name},
             ],
             "params": {
@@ -149,7 +196,7 @@ def test_rows_that_were_not_made_alike_are_told(paths: ScenePaths, tmp_path: Pat
     assert "Not made alike" in (tmp_path / "tables/comparison.tex").read_text()
     _locked(tmp_path, same, {"loop-0": "2.dir"})
     table.main(job(tmp_path), PARAMS)
-    told = "DerainNeRF with the loop (ours) (seed 0) had another ../pipeline/field than the rest."
+    told = "DerainNeRF with the loop (ours) (seed 0) had another pipeline/field than the rest."
     assert told in (tmp_path / "tables/tables.md").read_text()
 
 
@@ -167,7 +214,7 @@ def test_scenes_are_named_where_they_were_not_made_alike() -> None:
 def test_what_dvc_itself_writes_is_read(tmp_path: Path) -> None:
     lock = Path(__file__).resolve().parents[2] / "experiments/scenes/dvc.lock"
     made = read_recorded([lock])["data/street"]
-    assert "synthesize of params.yaml" in made and made["../../pipeline/drops"].endswith(".dir")
+    assert "synthesize of params.yaml" in made and made["pipeline/drops"].endswith(".dir")
     assert read_recorded([]) == {}
 
 
