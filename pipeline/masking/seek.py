@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.masking.agreement import agreement
+from pipeline.masking.agreement import correlation
 from pipeline.masking.align import aligned
 from pipeline.masking.glass import Glass, GlassCamera, LensGlass, PaneGlass
 from pipeline.masking.sweep import Found, agreement_on, find_glass
@@ -87,7 +87,7 @@ class Seeker:
 
 def cover(glass: PaneGlass, attentions: Sequence[np.ndarray]) -> float:
     """How well the views' attention agrees, cell by cell, on a pane on which they were brought to cover."""
-    return agreement(np.stack([glass.from_view(v, seen) for v, seen in enumerate(attentions)]))
+    return correlation(glass.tally(attentions))
 
 
 def shown(found: Found) -> float:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,17 @@ def test_what_is_gathered_a_few_rows_at_a_time_is_what_all_at_once_give() -> Non
         assert np.array_equal(found, whole, equal_nan=True)
     masks = [stack[view] > 0.5 for view in range(5)]
     assert np.allclose(gather(LensGlass(150, 7), masks, range(5), None)[0], np.mean(masks, axis=0))
+
+
+def test_a_quantile_does_not_hold_every_view_on_the_glass() -> None:
+    views = cameras(40)
+    glass = PaneGlass(pane_before(np.stack([v.cam_from_world for v in views]), 1.5), views)
+    glass.cell /= 5  # many more cells than pixels, as on a pane along which the photos go
+    glass.shape = (5 * glass.shape[0], 5 * glass.shape[1])
+    maps = [wetness(glass.pane_from_world, view) for view in views]
+    glass.from_view(0, maps[0])  # compiled
+    tracemalloc.start()
+    gather(glass, maps, range(40), 0.5)
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < 0.6 * 40 * 4 * glass.shape[0] * glass.shape[1]
