@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -19,7 +20,8 @@ OFF = 25  # the longer side over this: how far poses may put a view off on the p
 class Seeker:
     """Finds the glass and brings the views to cover each other there.
 
-    `farthest` and `at_least` as in `find_glass`; `wish` lens or pane is taken on trust.
+    `farthest` and `at_least` as in `find_glass`; `wish` lens or pane is taken on trust, but for a pane where
+    no plane is within reach.
     """
 
     def __init__(
@@ -41,12 +43,14 @@ class Seeker:
         """The glass as the residuals show it, unless the `attentions` (None: not used) showed a pane.
 
         A pane that they showed stays, and so do the views on it; told is then how well the
-        residuals agree on it.
+        residuals agree on it, and nothing of the lens (NaN), on which they were not looked at.
         """
         found, glass = before
         if attentions is None or not isinstance(glass, PaneGlass):
             found = self._look_again(residuals, found)
             found, glass = self._on(found, residuals if attentions is None else attentions)
+        else:
+            found = found._replace(lens_agreement=math.nan)
         if isinstance(glass, PaneGlass):
             found = found._replace(pane_agreement=agreement_on(glass, residuals))
         return found, glass
@@ -66,8 +70,10 @@ class Seeker:
         return self._granted(found)
 
     def _granted(self, found: Found) -> Found:
-        if self.wish == "auto" or (self.wish == "pane" and found.pane_from_world is None):
+        if self.wish == "auto":
             return found
+        if self.wish == "pane" and found.pane_from_world is None:
+            return found._replace(mode="none")
         return found._replace(mode=self.wish)
 
     def _on(

@@ -170,7 +170,7 @@ def test_masks_that_drop_most_raise_a_doubt(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("orientation", "upright"),  # upright or mirrored by half a mask has its photo's shape
+    ("orientation", "upright"),  # of 2 to 4 both have one shape, and are taken for the file's
     [*((code, False) for code in range(1, 9)), *((code, True) for code in range(5, 9))],
 )
 def test_masks_lie_where_their_photos_pixels_do(
