@@ -43,7 +43,7 @@ def main(job: Job, params: Params) -> str:
         if given:
             coverage = pass_on_masks(job.paths.images, records, fresh)
             origin = read_origin(job.paths.images).masked
-            told = {"mode": "given", "why": f"they came with the photos ({origin})"}
+            told: dict[str, Any] = {"mode": "given", "why": f"they came with the photos ({origin})"}
             how = ", by the masks that came with the photos"
         else:
             coverage, told = _drawn(job, params, records, fresh)

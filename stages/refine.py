@@ -64,7 +64,7 @@ def main(job: Job, params: Params) -> str:
         return f"the masks stay as they are: {why}"
     keep_masks = paths.masks if params.start != "none" else None
     views = read_transforms(paths.poses / "transforms.json")
-    held = max(LOOP_BYTES, *(held_bytes(view.width * view.height) for view in views.values()))
+    held = max([LOOP_BYTES, *(held_bytes(view.width * view.height) for view in views.values())])
     images = read_posed_images(paths.images, keep_masks, views, held)
     records, posed = [image.record for image in images], [image.view for image in images]
     field = GrowingField(images, params.far_factor, params.seed, job.device)

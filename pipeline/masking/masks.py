@@ -24,7 +24,7 @@ class Together(NamedTuple):
     `votes` (H, W) float64; `mean` (H, W) float32 is the sum over A_i / n in equation 5.
     """
 
-    count: int
+    views: int
     votes: np.ndarray
     mean: np.ndarray
 
@@ -89,7 +89,8 @@ def automatic_threshold(attentions: Iterable[np.ndarray]) -> float:
     maps of dry glass have no second class. The maps are looked at once, one after the other: what is kept
     of them is how often each value occurs, of which half precision knows few.
     """
-    values, counts = np.zeros(0, np.float32), np.zeros(0)
+    values: np.ndarray = np.zeros(0, np.float32)
+    counts: np.ndarray = np.zeros(0)
     for attention in attentions:
         more, occur = np.unique(attention, return_counts=True)
         values, place = np.unique(np.concatenate([values, more]), return_inverse=True)
@@ -125,7 +126,7 @@ def lens_fixedness(maps: Together) -> float:
     marked in another is 1; for masks unrelated between views it is their density p. Returned is
     (agreement - p) / (1 - p), from all pairs of views at once; 0 when nothing, or everything, is marked.
     """
-    count, votes = maps.count, maps.votes
+    count, votes = maps.views, maps.votes
     if count < 2:
         return 0.0
     density = votes.mean() / count
