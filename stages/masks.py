@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pipeline.errors import UserError
-from pipeline.io.atomic import publish_dir, write_json
+from pipeline.io.atomic import publish_dir, read_npy, write_json, write_npy
 from pipeline.io.given_masks import pass_on_masks
 from pipeline.io.maps import read_map
 from pipeline.io.masks import write_keep_mask
-from pipeline.io.scene import GIVEN_MASKS, read_images_json
+from pipeline.io.scene import GIVEN_MASKS, ImageRecord, read_images_json, read_origin
 from pipeline.masking import masks as masking
 from pipeline.parallel import map_named
 from pipeline.stage import Job, Section, run
@@ -35,63 +36,75 @@ class Params(Section):
 
 
 def main(job: Job, params: Params) -> str:
-    """Makes `artifacts/<scene>/masks/` from the attention maps."""
+    """Makes `artifacts/<scene>/masks/` from the attention maps, or of the masks that came along."""
     records = read_images_json(job.paths.images)
-    if params.use_given and (job.paths.images / GIVEN_MASKS).is_dir():
-        share = pass_on_masks(job.paths.images, records, job.paths.masks)
-        return f"{100 * share:.1f} % of the pixels masked, by the masks that came with the photos"
-    files = {record.name: job.paths.attention / f"{record.stem}.exr" for record in records}
-    maps = [read_map(files[record.name], size=record.size) for record in records]
-    t, chosen = masking.chosen_threshold(maps, params.threshold)
-    fixed, why = masking.on_the_lens(maps, t, params.temporal_mean, params.lens_fixed_from)
-    mean = masking.temporal_mean(maps) if fixed else None
+    given = params.use_given and (job.paths.images / GIVEN_MASKS).is_dir()
     with publish_dir(job.paths.masks) as fresh:
-        coverage = map_named(
-            write_mask,
-            {name: (path, mean, t, fresh / name, params) for name, path in files.items()},
-            job_label="masks",
-            scheduler=job.scheduler,
-        )
+        if given:
+            coverage = pass_on_masks(job.paths.images, records, fresh)
+            origin = read_origin(job.paths.images).masked
+            told: dict[str, Any] = {"mode": "given", "why": f"they came with the photos ({origin})"}
+            how = ", by the masks that came with the photos"
+        else:
+            coverage, told = _drawn(job, params, records, fresh)
+            mode = told["mode"].replace("per-image", "image by image")
+            how = f" at {told['threshold']:g}, {mode} ({told['why']})"
         everything = [name for name, share in coverage.items() if share == 1.0]
         if len(everything) == len(coverage):
             raise UserError(
                 "every pixel of every image would be masked: nothing would be left to learn from.",
-                "Raise masks.threshold or lower masks.dilation.",
+                "Black is dropped in masks that come along; masks.use_given: false does without them."
+                if given
+                else "Raise masks.threshold or lower masks.dilation.",
             )
         share = float(np.mean(list(coverage.values())))
-        write_json(
-            fresh / "masks.json",
-            {
-                "threshold": t,
-                "threshold_why": chosen,
-                "dilation": params.dilation,
-                "mode": "lens-fixed" if fixed else "per-image",
-                "why": why,
-                "mean_alone": fixed and params.mean_alone,
-                "coverage": {name: round(value, 6) for name, value in coverage.items()},
-                "mean_coverage": round(share, 6),
-                "fully_masked": everything,
-            },
-        )
-    for name in everything:
-        log.warning("%s is masked entirely and will teach the scene nothing", name)
-    if share == 0:
-        log.warning("no drops were found in any image; lower masks.threshold if there are some")
-    elif share > 0.6:
-        log.warning(
-            "%.0f %% of the pixels are masked, little is left to learn from: look at %s; where dry "
-            "glass is masked, raise masks.threshold, else wipe the glass and take the photos again",
-            100 * share, job.paths.masks,
-        )  # fmt: skip
-    mode = "lens-fixed" if fixed else "image by image"
-    return f"{100 * share:.1f} % of the pixels masked at {t:g}, {mode} ({why})"
+        told |= {
+            "coverage": {name: round(value, 6) for name, value in coverage.items()},
+            "mean_coverage": round(share, 6),
+            "fully_masked": everything,
+        }
+        write_json(fresh / "masks.json", told)
+    for sentence in masking.said(share, everything, given, job.paths.masks):
+        log.warning("%s", sentence)
+    return f"{100 * share:.1f} % of the pixels masked{how}"
+
+
+def _drawn(
+    job: Job, params: Params, records: Sequence[ImageRecord], fresh: Path
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """The share that each mask drops, by name, and what is told of how they came about."""
+    files = {r.name: (job.paths.attention / f"{r.stem}.exr", r.size) for r in records}
+
+    def maps() -> Iterator[np.ndarray]:
+        """One after the other: all at once they may be larger than the memory."""
+        return (read_map(path, size=size) for path, size in files.values())
+
+    t, chosen = masking.chosen_threshold(maps(), params.threshold)
+    seen = masking.together(maps(), t) if params.temporal_mean != "off" else None
+    fixed, why = masking.on_the_lens(seen, params.temporal_mean, params.lens_fixed_from)
+    mean = job.paths.work("masks") / "mean.npy" if seen is not None and fixed else None
+    if seen is not None and mean is not None:
+        write_npy(mean, seen.mean)  # a file, not an array that goes to a cluster with every task
+    tasks = {name: (*file, mean, t, fresh / name, params) for name, file in files.items()}
+    coverage = map_named(write_mask, tasks, job_label="masks", scheduler=job.scheduler)
+    if mean is not None:
+        mean.unlink()
+    return coverage, {
+        "threshold": t,
+        "threshold_why": chosen,
+        "dilation": params.dilation,
+        "mode": "lens-fixed" if fixed else "per-image",
+        "why": why,
+        "mean_alone": fixed and params.mean_alone,
+    }
 
 
 def write_mask(
-    attention: Path, mean: np.ndarray | None, t: float, path: Path, params: Params
+    attention: Path, size: tuple[int, int], mean: Path | None, t: float, path: Path, params: Params
 ) -> float:
-    """Writes one keep mask and returns the share of pixels it drops."""
-    drop_mask = masking.drop_mask_of(read_map(attention), mean, t, params.mean_alone)
+    """Writes one keep mask and returns the share of pixels it drops; `mean` is the mean map's file."""
+    together = None if mean is None else read_npy(mean)
+    drop_mask = masking.drop_mask_of(read_map(attention, size=size), together, t, params.mean_alone)
     drop_mask = masking.dilate(masking.without_specks(drop_mask, params.min_area), params.dilation)
     write_keep_mask(path, ~drop_mask)
     return float(drop_mask.mean())

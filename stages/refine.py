@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,6 +19,7 @@ from pipeline.io.masks import copy_keep_masks, write_drop_masks
 from pipeline.io.posed import LOOP_BYTES, PosedImage, read_posed_images
 from pipeline.io.transforms import read_transforms
 from pipeline.masking.account import account
+from pipeline.masking.align import held_bytes
 from pipeline.masking.glass import GlassCamera
 from pipeline.masking.loop import repair
 from pipeline.masking.residual import residual
@@ -62,15 +64,16 @@ def main(job: Job, params: Params) -> str:
         return f"the masks stay as they are: {why}"
     keep_masks = paths.masks if params.start != "none" else None
     views = read_transforms(paths.poses / "transforms.json")
-    images = read_posed_images(paths.images, keep_masks, views, LOOP_BYTES)
-    records = [image.record for image in images]
+    held = max([LOOP_BYTES, *(held_bytes(view.width * view.height) for view in views.values())])
+    images = read_posed_images(paths.images, keep_masks, views, held)
+    records, posed = [image.record for image in images], [image.view for image in images]
     field = GrowingField(images, params.far_factor, params.seed, job.device)
     with publish_dir(paths.refine) as fresh:
         copy_keep_masks(paths.masks, fresh)
         done = repair(
             lambda drop_masks, found: _look(job, params, field, drop_masks, fresh / "rounds"),
             [read_map(paths.attention / f"{r.stem}.exr", size=r.size) for r in records],
-            [_camera(image) for image in images],
+            [GlassCamera(v.cam_from_world, v.intrinsics, v.width, v.height) for v in posed],
             [~image.keep_mask for image in images],
             BEYOND * field.near,
             use_attention=params.start != "none",
@@ -106,14 +109,10 @@ def _look(
     tasks = {image.record.name: (image,) for image in field.images}
     workers = None if job.device == "cpu" else 1
     views = map_named(looked, tasks, job_label="render", workers=workers)
-    sure = field.sure({name: depth for name, (depth, _) in views.items()}, drops, params.witnesses)
+    depths, each = {n: view[0] for n, view in views.items()}, partial(map_named, job_label="trust")
+    sure = field.sure(depths, drops, params.witnesses, each)
     nan = np.float32(np.nan)
     return [np.where(sure[n], views[n][1], nan) if n in sure else None for n in drops]
-
-
-def _camera(image: PosedImage) -> GlassCamera:
-    view = image.view
-    return GlassCamera(view.cam_from_world, view.intrinsics, view.width, view.height)
 
 
 if __name__ == "__main__":

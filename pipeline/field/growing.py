@@ -116,10 +116,12 @@ class GrowingField:
         depths: Mapping[str, np.ndarray],
         drop_masks: Mapping[str, np.ndarray],
         fewest: int,
+        each: Each,
     ) -> dict[str, np.ndarray]:
         """Where the field has reason to know what it shows, (H, W) by name of the fitted images.
 
-        There `fewest` other fitted images saw the surface uncovered; `depths` (H, W) as rendered.
+        There `fewest` other fitted images saw the surface uncovered; `depths` (H, W) as rendered. ``each``
+        maps a function over tasks by name.
         """
         fitted = [image for image in self.images if image.record.split == "train"]
         names = [image.record.name for image in fitted]
@@ -132,7 +134,7 @@ class GrowingField:
             )
             for name, image in zip(names, fitted, strict=True)
         ]
-        return {name: seen_by_others(index, witnesses, fewest) for index, name in enumerate(names)}
+        return each(seen_by_others, {name: (i, witnesses, fewest) for i, name in enumerate(names)})
 
     def aligned(self, image: PosedImage, steps: int) -> np.ndarray:
         """The pose (4, 4) at which the field lies best on the image's uncovered pixels."""

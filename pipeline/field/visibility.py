@@ -28,6 +28,15 @@ def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) 
     The surface is where the field's own depth puts it; a photo saw it when the point falls on a
     kept pixel whose depth agrees within 5 per cent.
     """
+    points, shape = _surface(view, stride)
+    count = np.zeros(points.shape[1], np.uint16)
+    for other in witnesses:
+        count += _sees(other, points)
+    return count.reshape(shape)
+
+
+def _surface(view: Witness, stride: int) -> tuple[np.ndarray, tuple[int, ...]]:
+    """The points (3, N), in the world, at every ``stride``-th pixel of a view, and these' rows and columns."""
     fx, fy, cx, cy, k1 = view.intrinsics
     height, width = view.depth.shape
     rows, columns = np.mgrid[0:height:stride, 0:width:stride]
@@ -38,11 +47,7 @@ def witness_count(view: Witness, witnesses: Sequence[Witness], stride: int = 2) 
         x, y = (flat.numpy() for flat in undistort(*bent, torch.tensor(k1, dtype=bent[0].dtype)))
     world_from_cam = np.linalg.inv(view.cam_from_world)
     cam = np.stack([x * depth, y * depth, depth])
-    points = world_from_cam[:3, :3] @ cam + world_from_cam[:3, 3:]
-    count = np.zeros(depth.size, np.uint16)
-    for other in witnesses:
-        count += _sees(other, points)
-    return count.reshape(rows.shape)
+    return world_from_cam[:3, :3] @ cam + world_from_cam[:3, 3:], rows.shape
 
 
 def shares(count: np.ndarray) -> dict[str, float]:
@@ -54,11 +59,18 @@ def shares(count: np.ndarray) -> dict[str, float]:
 
 
 def seen_by_others(index: int, witnesses: Sequence[Witness], fewest: int) -> np.ndarray:
-    """Which pixels ``(H, W)`` of one witness show a surface that ``fewest`` others saw uncovered."""
-    own = witnesses[index]
-    others = [witness for number, witness in enumerate(witnesses) if number != index]
-    seen = witness_count(own, others, stride=2) >= fewest
-    height, width = own.depth.shape
+    """Which pixels ``(H, W)`` of one witness show a surface that ``fewest`` others saw uncovered.
+
+    The others are asked in order of their distance in the row, about what is open still.
+    """
+    own, (height, width) = witnesses[index], witnesses[index].depth.shape
+    points, shape = _surface(own, stride=2)
+    count, left = np.zeros(points.shape[1], np.uint16), np.arange(points.shape[1])
+    for other in sorted(range(len(witnesses)), key=lambda number: abs(number - index)):
+        left = left[count[left] < fewest]
+        if other != index and left.size:
+            count[left] += _sees(witnesses[other], points[:, left])
+    seen = (count >= fewest).reshape(shape)
     return np.repeat(np.repeat(seen, 2, axis=0), 2, axis=1)[:height, :width]
 
 

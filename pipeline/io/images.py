@@ -28,16 +28,20 @@ Image.MAX_IMAGE_PIXELS = None
 # EXIF orientation -> degrees counter-clockwise that make the stored pixels upright. The mirrored codes
 # (2, 4, 5, 7) come from editing programs, not cameras; they are undone before the turn.
 _TURN = {1: 0, 2: 0, 3: 180, 4: 180, 5: 270, 6: 270, 7: 90, 8: 90}
-_MIRRORED = {2: 0, 4: 0, 5: 1, 7: 1}
+_MIRRORED = frozenset({2, 4, 5, 7})
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 
 @dataclass(frozen=True)
 class PhotoInfo:
-    """What a photo's metadata says: turn to be upright (degrees counter-clockwise), focal length (px)."""
+    """What a photo's metadata says: turn to be upright (degrees counter-clockwise), focal length (px).
+
+    `mirrored`: its file holds the pixels mirrored; see :func:`unmirrored`.
+    """
 
     upright_turn: int
     focal_px: float | None
+    mirrored: bool = False
 
 
 def _decoded(path: Path, how: int) -> np.ndarray | None:
@@ -175,8 +179,16 @@ def _sensor_pixels(photo: Image.Image) -> np.ndarray:
         pixels = np.array(Image.alpha_composite(black, photo.convert("RGBA")).convert("RGB"))
     else:
         pixels = np.array(photo.convert("RGB"))
-    flip = _MIRRORED.get(_orientation(photo))
-    return pixels if flip is None else np.ascontiguousarray(np.flip(pixels, axis=1 - flip))
+    info = _photo_info(photo)
+    return unmirrored(pixels, info.upright_turn) if info.mirrored else pixels
+
+
+def unmirrored(pixels: np.ndarray, upright_turn: int) -> np.ndarray:
+    """`pixels` of a file that holds them mirrored as the sensor saw them; they may be a mask drawn over it.
+
+    Those that are turned by a quarter to be upright are mirrored top to bottom, others left to right.
+    """
+    return np.ascontiguousarray(np.flip(pixels, axis=0 if upright_turn % 180 else 1))
 
 
 def _orientation(photo: Image.Image) -> int:
@@ -196,7 +208,8 @@ def _photo_info(photo: Image.Image) -> PhotoInfo:
         if math.isfinite(equivalent) and equivalent > 0
         else None
     )
-    return PhotoInfo(_TURN[_orientation(photo)], focal)
+    orientation = _orientation(photo)
+    return PhotoInfo(_TURN[orientation], focal, orientation in _MIRRORED)
 
 
 def turn(pixels: np.ndarray, degrees: int) -> np.ndarray:

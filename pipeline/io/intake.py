@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.errors import UserError
 from pipeline.io.capture import Capture
 from pipeline.io.given import SAME_SHAPE, GivenView, Straightener, straightened
-from pipeline.io.images import turn
+from pipeline.io.images import turn, unmirrored
 from pipeline.io.lenses import lens_of
 from pipeline.io.masks import fit_mask, read_foreign_mask, read_rain_mask, write_keep_mask
 from pipeline.io.photos import Photo, Plan
@@ -155,10 +155,12 @@ def write_given_masks(
 def _turned_as_its_photo(
     name: str, keep_mask: np.ndarray, photo: Photo, degrees: int
 ) -> np.ndarray:
-    """A mask drawn over the stored pixels, or over the upright ones, turned as the image is."""
+    """A mask drawn over the pixels as stored, or over the upright ones, turned as the image is."""
     ratio = keep_mask.shape[1] / keep_mask.shape[0]
     for already in (0, photo.upright_turn):
         if abs(ratio / photo.ratio_after(already) - 1) < SAME_SHAPE:
+            if photo.mirrored and already == 0:
+                keep_mask = unmirrored(keep_mask, photo.upright_turn)
             return turn(keep_mask, degrees - already)
     raise UserError(
         f"the mask of {Path(name).stem} has {keep_mask.shape[1]}x{keep_mask.shape[0]} pixels, its "
@@ -176,11 +178,11 @@ def masks_said(masked: str, share: float | None, photos: Mapping[str, Photo]) ->
         said.append(
             "the masks drop most of the photos: are they upside down? black is dropped here"
         )
-    turned = [photo for photo in photos.values() if photo.upright_turn]
+    turned = [photo for photo in photos.values() if photo.upright_turn or photo.mirrored]
     unsure = sum(photo.ratio_after(0) == photo.ratio_after(photo.upright_turn) for photo in turned)
     if unsure:
         said.append(
-            f"the metadata turns {unsure} photos so that their masks' shape does not tell whether these are "
-            "turned too: they are taken as drawn over the photos as stored"
+            f"the metadata turns or mirrors {unsure} photos so that their masks' shape does not tell whether "
+            "these are too: they are taken as drawn over the photos as stored"
         )
     return said

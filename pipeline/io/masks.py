@@ -72,7 +72,7 @@ def read_foreign_mask(path: Path) -> np.ndarray:
 
     Black is dropped: values from 128 up are kept; in a file of 0 to 1 those from 0.5 up, in one that goes
     beyond 255 those from 32768 up. Colour and alpha are ignored where all channels agree. UserError when
-    unreadable or coloured.
+    unreadable or coloured, when alone its alpha tells one place from another, or when values are no numbers.
     """
     values = _decoded(path)
     if values is None:
@@ -81,7 +81,17 @@ def read_foreign_mask(path: Path) -> np.ndarray:
         colours = values[..., :3]
         if (colours != colours[..., :1]).any():
             raise UserError(f"{path} is coloured; a mask is black and white.", "Save it as grey.")
-        values = colours[..., 0]
+        clear, values = values[..., 3:], colours[..., 0]
+        if clear.size and np.ptp(clear) > 0 and np.ptp(values) == 0:
+            raise UserError(
+                f"{path} is of one colour, and more or less transparent; a mask is black and white.",
+                "Save its transparency as grey: white is kept, black is dropped.",
+            )
+    if not np.isfinite(values).all():
+        raise UserError(
+            f"{path} holds NaN or infinity; a mask is black and white.",
+            "Save it as 8-bit grey PNG.",
+        )
     top = float(values.max())
     middle = next((half for most, half in _MIDDLES if top <= most), 32768)
     return values >= middle

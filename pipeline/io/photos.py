@@ -25,13 +25,17 @@ Straighten = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Photo:
-    """What `examine` finds out: stored size, turn to be upright (degrees ccw), focal length, checksum."""
+    """What `examine` finds out: stored size, turn to be upright (degrees ccw), focal length, checksum.
+
+    `mirrored`: the file holds the pixels mirrored (`pipeline.io.images.unmirrored`).
+    """
 
     width: int
     height: int
     upright_turn: int
     focal_px: float | None
     sha256: str
+    mirrored: bool = False
 
     def size_after(self, degrees: int) -> tuple[int, int]:
         """(width, height) once turned by `degrees`."""
@@ -126,8 +130,9 @@ def _refuse_unreadable_kind(path: Path) -> None:
 def examine(path: Path) -> Photo:
     """Decodes the whole photo and tells its size, orientation, focal length and SHA-256."""
     pixels, info = read_photo(path)
-    digest = file_sha256(path)
-    return Photo(pixels.shape[1], pixels.shape[0], info.upright_turn, info.focal_px, digest)
+    height, width = pixels.shape[:2]
+    turned, digest = info.upright_turn, file_sha256(path)
+    return Photo(width, height, turned, info.focal_px, digest, info.mirrored)
 
 
 def file_sha256(path: Path) -> str:

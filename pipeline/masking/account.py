@@ -46,11 +46,15 @@ def _round(one: Round) -> Mapping[str, Any]:
         "changed": round(one.changed, 6),
         "glass": describe(one.found),
         "window": one.window,
-        "lens_agreement": round(one.found.lens_agreement, 4),
-        "pane_agreement": round(one.found.pane_agreement, 4),
+        "lens_agreement": _rounded(one.found.lens_agreement, 4),
+        "pane_agreement": _rounded(one.found.pane_agreement, 4),
     }
     if one.redrawn is not None:
         for name in ("contrast", "level", "known"):
-            value = getattr(one.redrawn, name)
-            numbers[name] = round(value, 5) if math.isfinite(value) else None
+            numbers[name] = _rounded(getattr(one.redrawn, name), 5)
     return numbers
+
+
+def _rounded(value: float, places: int) -> float | None:
+    """None for what is not known."""
+    return round(value, places) if math.isfinite(value) else None

@@ -13,6 +13,8 @@ import scipy.fft
 from pipeline.masking.glass import PaneGlass
 
 CELLS = 120_000
+# Of each view while all are brought to cover: per cell, and per pixel what the loop holds besides.
+CELL_BYTES, PIXEL_BYTES = 17, 22
 SWEEPS = ((2.0, 3), (1.0, 4))  # blur in pixels, and how often every view is fitted with it
 PROBE_PX = 0.5  # how far a camera is moved to see what that does to its map
 MOST_PX = 2.0  # that a camera moves at a time
@@ -47,6 +49,11 @@ def aligned(
             _fit(coarse, smooth)
             coarse.moved[chosen] -= coarse.moved[chosen].mean(axis=0)
     return coarse.moved
+
+
+def held_bytes(pixels: int) -> int:
+    """Per pixel of views of so many `pixels`, what is held at most while they are brought to cover."""
+    return PIXEL_BYTES + math.ceil(CELL_BYTES * CELLS / pixels)
 
 
 def _shift(glass: PaneGlass, maps: Sequence[np.ndarray | None], reach: int) -> None:

@@ -23,6 +23,8 @@ from pipeline.masking.agreement import Tally
 
 MAX_CELLS = 1_000_000
 BAND = 64  # rows of cells whose quantile over the views is taken at a time
+EVERY = slice(None)  # row
+FOLDS = 2.0 / 3.0  # where 1 + k1 r^2 is less, the picture of a lens with k1 < 0 folds back
 
 
 class GlassCamera(NamedTuple):
@@ -41,8 +43,8 @@ class Glass(Protocol):
     def shape(self) -> tuple[int, int]:
         """Rows and columns of cells."""
 
-    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
-        """A view's (H, W) map on the cells, float32; NaN where the view does not see a cell."""
+    def from_view(self, view: int, values: np.ndarray, rows: slice = EVERY) -> np.ndarray:
+        """A view's (H, W) map on the `rows` of cells, float32; NaN where the view does not see a cell."""
 
     def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
         """A map of the cells as the view sees it, (H, W) float32; NaN beside the glass."""
@@ -54,9 +56,9 @@ class LensGlass:
     def __init__(self, height: int, width: int) -> None:
         self.shape = (height, width)
 
-    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
+    def from_view(self, view: int, values: np.ndarray, rows: slice = EVERY) -> np.ndarray:
         """See :class:`Glass`."""
-        return np.asarray(values, np.float32)
+        return np.asarray(values[rows], np.float32)
 
     def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
         """See :class:`Glass`."""
@@ -117,10 +119,11 @@ class PaneGlass:
         moved = self.cameras[view].cam_from_world[:3, :3] @ self.moved[view]
         return self.depth * pose[:3, :3] + np.outer(pose[:3, 3] + moved, self.normal)
 
-    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
+    def from_view(self, view: int, values: np.ndarray, rows: slice = EVERY) -> np.ndarray:
         """See :class:`Glass`."""
-        x, y = np.empty((2, *self.shape), np.float32)
-        _places(*self._way(view), x, y)
+        across, down, matrix, lens = self._way(view)
+        x, y = np.empty((2, down[rows].size, across.size), np.float32)
+        _places(across, down[rows], matrix, lens, x, y)
         return _sample(values, x, y)
 
     def tally(self, maps: Sequence[np.ndarray]) -> Tally:
@@ -130,15 +133,14 @@ class PaneGlass:
             _add_view(*self._way(view), np.ascontiguousarray(values, np.float32), *tally)
         return tally
 
-    def _way(self, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int, int]:
+    def _way(self, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """From the cells to a view's pixels, as `_place` takes it."""
-        camera = self.cameras[view]
-        fx, fy, cx, cy, k1 = camera.intrinsics
+        fx, fy, cx, cy, k1 = self.cameras[view].intrinsics
         across = (self.low[0] + (np.arange(self.shape[1]) + 0.5) * self.cell).astype(np.float32)
         down = (self.low[1] + (np.arange(self.shape[0]) + 0.5) * self.cell).astype(np.float32)
         matrix = np.vstack([self.view_from_glass(view), self.normal]).astype(np.float32)
         lens = np.array([fx, fy, cx - 0.5, cy - 0.5, k1], np.float32)
-        return across, down, matrix, lens, camera.width, camera.height
+        return across, down, matrix, lens
 
     def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
         """See :class:`Glass`."""
@@ -194,27 +196,32 @@ def gather(
     `maps[view]` (H, W), bool or float, may hold NaN for pixels without a vote; None for a view without a
     map. Out come float32 values, NaN where nobody votes, and the number of votes per cell, int32.
     """
+    voting = [(view, values) for view in views if (values := maps[view]) is not None]
+    if quantile is not None:
+        return _quantile_on(glass, voting, quantile)
     votes, total = np.zeros(glass.shape, np.int32), np.zeros(glass.shape)
-    kept: list[np.ndarray] = []
-    for view in views:
-        if (values := maps[view]) is not None:
-            seen = glass.from_view(view, values)
-            known = np.isfinite(seen)
-            votes += known
-            if quantile is None:
-                total += np.where(known, seen, np.float32(0))
-            else:
-                kept.append(seen)
-    if quantile is None:
-        return (total / np.where(votes > 0, votes, np.nan)).astype(np.float32), votes
-    if not kept:
-        return np.full(glass.shape, np.nan, np.float32), votes
+    for view, values in voting:
+        seen = glass.from_view(view, values)
+        known = np.isfinite(seen)
+        votes += known
+        total += np.where(known, seen, np.float32(0))
+    return (total / np.where(votes > 0, votes, np.nan)).astype(np.float32), votes
+
+
+def _quantile_on(
+    glass: Glass, voting: Sequence[tuple[int, np.ndarray]], quantile: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The quantile of the views' maps on the glass, and the votes."""
+    found, votes = np.full(glass.shape, np.nan, np.float32), np.zeros(glass.shape, np.int32)
+    if not voting:
+        return found, votes
     # A few rows at a time: the stack of all views may be larger than the photos.
-    bands = [
-        quantile_over_views(np.stack([seen[row : row + BAND] for seen in kept]), quantile)
-        for row in range(0, glass.shape[0], BAND)
-    ]
-    return np.concatenate(bands), votes
+    for row in range(0, glass.shape[0], BAND):
+        rows = slice(row, row + BAND)
+        stack = np.stack([glass.from_view(view, values, rows) for view, values in voting])
+        found[rows] = quantile_over_views(stack, quantile)
+        votes[rows] = np.isfinite(stack).sum(axis=0)
+    return found, votes
 
 
 def quantile_over_views(stack: np.ndarray, quantile: float) -> np.ndarray:
@@ -248,7 +255,7 @@ def _directions(
 
 
 @compiled
-def _place(u, v, matrix, lens, width, height):  # type: ignore[no-untyped-def]
+def _place(u, v, matrix, lens):  # type: ignore[no-untyped-def]
     """The pixel (x, y) at which a view shows a cell that the mean camera sees at ``u``, ``v``.
 
     ``matrix`` (4, 3) leads from there to the view, its last row to the mean camera's depth; ``lens``: fx, fy,
@@ -261,28 +268,28 @@ def _place(u, v, matrix, lens, width, height):  # type: ignore[no-untyped-def]
     s = (matrix[0, 0] * u + (matrix[0, 1] * v + matrix[0, 2])) / z
     t = (matrix[1, 0] * u + (matrix[1, 1] * v + matrix[1, 2])) / z
     gain = one + k1 * (s * s + t * t)
-    # Far outside its frame a lens with k1 < 0 folds points back into it.
-    framed = abs(s) * fx < width and abs(t) * fy < height
-    return fx * s * gain + cx if z > 0 and front > 0 and framed else nowhere, fy * t * gain + cy
+    # Farther out a lens with k1 < 0 folds points back into its frame.
+    whole = gain > np.float32(FOLDS)
+    return fx * s * gain + cx if z > 0 and front > 0 and whole else nowhere, fy * t * gain + cy
 
 
 @compiled
-def _places(across, down, matrix, lens, width, height, x, y):  # type: ignore[no-untyped-def]
+def _places(across, down, matrix, lens, x, y):  # type: ignore[no-untyped-def]
     """Fills ``x`` and ``y`` (R, C) with the pixels of the cells at ``down`` (R,) and ``across`` (C,)."""
     for row in range(down.size):
         for column in range(across.size):
             u, v = across[column], down[row]
-            x[row, column], y[row, column] = _place(u, v, matrix, lens, width, height)
+            x[row, column], y[row, column] = _place(u, v, matrix, lens)
 
 
 @compiled
-def _add_view(across, down, matrix, lens, width, height, values, votes, total, squares):  # type: ignore[no-untyped-def]
+def _add_view(across, down, matrix, lens, values, votes, total, squares):  # type: ignore[no-untyped-def]
     """Adds to a tally of the cells what a view's map ``values`` says of those that it sees."""
     rows, columns = values.shape
     right, bottom = np.float32(columns - 0.5), np.float32(rows - 0.5)
     for row in range(down.size):
         for column in range(across.size):
-            x, y = _place(across[column], down[row], matrix, lens, width, height)
+            x, y = _place(across[column], down[row], matrix, lens)
             if not (x >= -0.5 and x <= right and y >= -0.5 and y <= bottom):
                 continue
             x, y = max(x, np.float32(0.0)), max(y, np.float32(0.0))

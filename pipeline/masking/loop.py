@@ -25,6 +25,11 @@ STEADY = 0.6  # agreement on a pane, once aligned, from which gathering gains mo
 CLEAR = 0.6  # agreement of the residual on the glass from which it adds to what the attention told
 
 
+OUT_OF_REACH = (
+    "no plane is within reach: the photos were taken from one place, or from too far apart"
+)
+
+
 class Round(NamedTuple):
     """The state after a round: round 0 is the start, before any fit.
 
@@ -70,17 +75,19 @@ def repair(
     `look` fits the scene to what the masks leave and returns the residuals. The glass is found from
     the `attentions`, and again from the residuals unless the attention showed a pane; `mode` lens or
     pane is taken on trust. With `gather_attention` the loop starts from the attention gathered there
-    (the general form of equation 5). The loop ends early when fewer than the share `settled` of the
-    pixels change, and keeps the masks that it had when the residual shows no glass, when it agrees
-    there less than is needed to add to the attention (a poor field disagrees everywhere), or when the
-    disagreement inside the new masks is not `contrast` times that outside. `window` auto: see
-    `chosen_window`. Other parameters as in `redraw_views`.
+    (the general form of equation 5). The loop ends early when fewer than the share `settled` of the pixels
+    change, and keeps the masks that it had when `mode` is pane and none is within reach, when the residual
+    shows no glass, when it agrees there less than is needed to add to the attention (a poor field disagrees
+    everywhere), or when the disagreement inside the new masks is not `contrast` times that outside. `window`
+    auto: see `chosen_window`. Other parameters as in `redraw_views`.
     """
     told = attentions if use_attention else None
     seeker = Seeker(cameras, farthest, agreement, mode)
     found, glass = seeker.first(attentions)
     width = _width(window, found, glass, attentions, cameras)
     masks, doubt = list(drop_masks), ""
+    if mode == "pane" and found.pane_from_world is None:
+        doubt = f"refine.mode is pane, but {OUT_OF_REACH}"
     if use_attention and isinstance(glass, PaneGlass) and (c := cover(glass, attentions)) < STEADY:
         doubt = f"the views do not cover each other well enough on the pane ({c:.2f})"
     if gather_attention and found.mode != "none" and not doubt:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
-from pipeline.masking.agreement import agreement
+from pipeline.masking.agreement import correlation
 from pipeline.masking.align import aligned
 from pipeline.masking.glass import Glass, GlassCamera, LensGlass, PaneGlass
 from pipeline.masking.sweep import Found, agreement_on, find_glass
@@ -19,7 +20,8 @@ OFF = 25  # the longer side over this: how far poses may put a view off on the p
 class Seeker:
     """Finds the glass and brings the views to cover each other there.
 
-    `farthest` and `at_least` as in `find_glass`; `wish` lens or pane is taken on trust.
+    `farthest` and `at_least` as in `find_glass`; `wish` lens or pane is taken on trust, but for a pane where
+    no plane is within reach.
     """
 
     def __init__(
@@ -41,12 +43,14 @@ class Seeker:
         """The glass as the residuals show it, unless the `attentions` (None: not used) showed a pane.
 
         A pane that they showed stays, and so do the views on it; told is then how well the
-        residuals agree on it.
+        residuals agree on it, and nothing of the lens (NaN), on which they were not looked at.
         """
         found, glass = before
         if attentions is None or not isinstance(glass, PaneGlass):
             found = self._look_again(residuals, found)
             found, glass = self._on(found, residuals if attentions is None else attentions)
+        else:
+            found = found._replace(lens_agreement=math.nan)
         if isinstance(glass, PaneGlass):
             found = found._replace(pane_agreement=agreement_on(glass, residuals))
         return found, glass
@@ -66,8 +70,10 @@ class Seeker:
         return self._granted(found)
 
     def _granted(self, found: Found) -> Found:
-        if self.wish == "auto" or (self.wish == "pane" and found.pane_from_world is None):
+        if self.wish == "auto":
             return found
+        if self.wish == "pane" and found.pane_from_world is None:
+            return found._replace(mode="none")
         return found._replace(mode=self.wish)
 
     def _on(
@@ -87,7 +93,7 @@ class Seeker:
 
 def cover(glass: PaneGlass, attentions: Sequence[np.ndarray]) -> float:
     """How well the views' attention agrees, cell by cell, on a pane on which they were brought to cover."""
-    return agreement(np.stack([glass.from_view(v, seen) for v, seen in enumerate(attentions)]))
+    return correlation(glass.tally(attentions))
 
 
 def shown(found: Found) -> float:

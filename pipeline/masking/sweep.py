@@ -216,10 +216,11 @@ def prepared(
         height, width = values.shape
         factor = min(1.0, longest / max(height, width))
         size = (max(2, round(width * factor)), max(2, round(height * factor)))
-        known = np.isfinite(values).astype(np.float32)
-        filled = np.nan_to_num(values - _slope(values), nan=0.0).astype(np.float32)
-        known = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
-        filled = cv2.resize(filled, size, interpolation=cv2.INTER_AREA)
+        known, filled = (
+            cv2.resize(one.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            for one in (np.isfinite(values), np.nan_to_num(values))
+        )
+        filled -= known * _slope(filled / np.maximum(known, 1e-6), known)
         sigma = max(size) / 10
         broad = cv2.GaussianBlur(filled, (0, 0), sigma)
         weight = cv2.GaussianBlur(known, (0, 0), sigma)
@@ -232,14 +233,15 @@ def prepared(
     return out, small
 
 
-def _slope(values: np.ndarray) -> np.ndarray:
-    """The paraboloid that lies nearest to `values` (H, W) where they are known."""
+def _slope(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The paraboloid (H, W) that lies nearest to `values`, which weigh as much as is `known` of each."""
     y, x = (np.linspace(-1, 1, n) for n in values.shape)
     ones = np.ones(values.shape)
     terms = np.stack([ones, ones * x, ones * y[:, None], ones * x**2, ones * y[:, None] ** 2,
                       x * y[:, None]], axis=-1)  # fmt: skip
-    known = np.isfinite(values)
-    if known.sum() < terms.shape[-1]:
-        return np.zeros(values.shape)
-    coefficients, *_ = np.linalg.lstsq(terms[known], values[known].astype(np.float64))
-    return terms @ coefficients
+    if (known > 0).sum() < terms.shape[-1]:
+        return np.zeros(values.shape, np.float32)
+    weights = np.sqrt(known, dtype=np.float64)[..., None]
+    weighted = (weights * terms).reshape(-1, terms.shape[-1])
+    coefficients, *_ = np.linalg.lstsq(weighted, (weights[..., 0] * values).ravel())
+    return (terms @ coefficients).astype(np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -60,25 +61,23 @@ def redraw_views(
     join = JOIN
     if attentions is not None:
         join = JOIN_ON_PANE if isinstance(glass, PaneGlass) else JOIN_ON_LENS
-    everything = range(count)
-    cache: dict[range, Redrawn] = {}
+    everything, longer = range(count), max(drop_masks[0].shape)
     overall = gather(glass, residuals, everything, quantile)
 
+    @lru_cache(maxsize=1)  # neighbours only move on, and each holds as much as several photos
     def redrawn(views: range) -> Redrawn:
-        if views not in cache:
-            apart = views != everything
-            gathered, votes = gather(glass, residuals, views, quantile) if apart else overall
-            old, _ = gather(glass, drop_masks, views, None)
-            seen = None if attentions is None else gather(glass, attentions, views, None)[0]
-            longer = max(drop_masks[0].shape)
-            previous = np.nan_to_num(old) > 0.5
-            cache[views] = redraw(
-                gathered, votes, previous, fewest,
-                reach=longer / SURROUNDINGS, spill=longer / NEARBY, join=join, attention=seen,
-            )  # fmt: skip
-        return cache[views]
+        apart = views != everything
+        gathered, votes = gather(glass, residuals, views, quantile) if apart else overall
+        old, _ = gather(glass, drop_masks, views, None)
+        seen = None if attentions is None else gather(glass, attentions, views, None)[0]
+        found = redraw(
+            gathered, votes, np.nan_to_num(old) > 0.5, fewest,
+            reach=longer / SURROUNDINGS, spill=longer / NEARBY, join=join, attention=seen,
+        )  # fmt: skip
+        told.append((found.contrast, found.level))
+        return found
 
-    fresh, known = [], []
+    fresh, known, told = [], [], list[tuple[float, float]]()
     for view, old in enumerate(drop_masks):
         found = redrawn(neighbours(count, view, width))
         margin = glass.to_view(view, found.margin)
@@ -86,14 +85,8 @@ def redraw_views(
         drops = np.where(np.isfinite(margin), margin > 0, old)
         fresh.append(drops | dilate(drops & (decided > 0.5), dilation))
         known.append(decided.mean())
-    facts = list(cache.values())
-    return RedrawnViews(
-        fresh,
-        np.nan_to_num(overall[0]),
-        _median([found.contrast for found in facts]),
-        _median([found.level for found in facts]),
-        float(np.mean(known)),
-    )
+    contrast, level = (_median(values) for values in zip(*told, strict=True))
+    return RedrawnViews(fresh, np.nan_to_num(overall[0]), contrast, level, float(np.mean(known)))
 
 
 def _median(values: Sequence[float]) -> float:
@@ -123,13 +116,14 @@ def attention_on_glass(
     """
     t = MEANS * automatic_threshold(attentions)
     count = len(attentions)
-    cache: dict[range, np.ndarray] = {}
+
+    @lru_cache(maxsize=1)  # neighbours only move on
+    def gathered(views: range) -> np.ndarray:
+        return gather(glass, attentions, views, None)[0]
+
     fresh = []
     for view, old in enumerate(drop_masks):
-        views = neighbours(count, view, width)
-        if views not in cache:
-            cache[views] = gather(glass, attentions, views, None)[0]
-        mean = glass.to_view(view, cache[views])
+        mean = glass.to_view(view, gathered(neighbours(count, view, width)))
         fresh.append(np.where(np.isfinite(mean), dilate(threshold(mean, t), dilation), old))
     return fresh
 

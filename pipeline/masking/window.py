@@ -83,8 +83,9 @@ def chosen_window(alike: np.ndarray) -> int:
 
     `alike` as from `alike_by_distance` or `alike_on_pane`. Drops that stay, and photos without order, are
     as alike far apart as side by side; where neighbours hardly agree, order means nothing. Where photos in
-    the farther half of the distances agree less than `HOLDS` of what neighbours do, the window is as wide
-    as photos in it still agree to that.
+    the farther half of the distances agree less than `HOLDS` of what neighbours do, the window reaches
+    half as far to either side of its middle as the nearest photos that agree less than that lie apart; its
+    ends may lie as far apart as these.
     """
     count = len(alike) + 1
     if count < FEWEST_PHOTOS or not alike[0] >= NEIGHBOURS:  # NaN too

@@ -336,6 +336,33 @@ def test_a_coloured_mask_is_refused_and_a_small_one_scaled(tmp_path: Path) -> No
     assert fit_mask(keep_mask, (2, 2)).tolist() == [[False, True], [True, True]]
 
 
+@pytest.mark.parametrize("colour", [0, 255])
+def test_a_mask_in_the_transparency_is_refused_and_one_beside_it_is_read(
+    tmp_path: Path, colour: int
+) -> None:
+    grey = Image.new("L", (6, 4), 255)
+    grey.paste(0, (0, 0, 3, 4))
+    flat = Image.new("L", (6, 4), colour)
+    for kind, channels in (("LA", [flat, grey]), ("RGBA", [flat, flat, flat, grey])):
+        Image.merge(kind, channels).save(tmp_path / "m.png")
+        with pytest.raises(UserError, match="more or less transparent"):
+            read_foreign_mask(tmp_path / "m.png")
+    for clear in (grey, Image.new("L", (6, 4), 255), Image.new("L", (6, 4), 128)):
+        Image.merge("LA", [grey, clear]).save(tmp_path / "m.png")
+        assert read_foreign_mask(tmp_path / "m.png").tolist() == [[False] * 3 + [True] * 3] * 4
+    Image.merge("LA", [flat, Image.new("L", (6, 4), 255)]).save(tmp_path / "m.png")
+    assert (read_foreign_mask(tmp_path / "m.png") == (colour > 0)).all()  # all is kept, or dropped
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_mask_with_values_that_are_no_numbers_is_refused(tmp_path: Path, wrong: float) -> None:
+    values = np.ones((4, 6), np.float32)
+    values[0, 0] = wrong
+    cv2.imwrite(str(tmp_path / "m.tiff"), values)
+    with pytest.raises(UserError, match="holds NaN or infinity; a mask"):
+        read_foreign_mask(tmp_path / "m.tiff")
+
+
 def test_masks_are_found_by_any_usual_name_and_for_all_or_none(tmp_path: Path) -> None:
     _photos(tmp_path)
     (tmp_path / "masks").mkdir()

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from pipeline.errors import UserError
 from pipeline.io.given import GivenView
@@ -141,13 +141,11 @@ def test_rain_masks_are_scaled_and_passed_on_with_the_right_polarity(tmp_path: P
     np.save(data / "rainMask.npy", drops)
     images = _ingest(tmp_path)
     assert read_origin(images).masked == "rainMask.npy"
-    share = pass_on_masks(images, read_images_json(images), tmp_path / "masks")
-    assert share == pytest.approx(20 * 10 / (40 * 30) / 3, abs=1e-6)
+    coverage = pass_on_masks(images, read_images_json(images), tmp_path / "masks")
+    assert coverage == pytest.approx({"a.png": 0, "b.png": 20 * 10 / (40 * 30), "c.png": 0})
     keep_mask = read_keep_mask(tmp_path / "masks/b.png", (80, 60))
     assert not keep_mask[:20, :40].any() and keep_mask[20:].all() and keep_mask[:, 40:].all()
     assert read_keep_mask(tmp_path / "masks/a.png").all()
-    about = json.loads((tmp_path / "masks/masks.json").read_text())
-    assert about["mode"] == "given" and about["coverage"]["b.png"] == pytest.approx(1 / 6, abs=1e-6)
 
 
 def test_masks_of_another_shape_are_refused(tmp_path: Path) -> None:
@@ -171,17 +169,43 @@ def test_masks_that_drop_most_raise_a_doubt(tmp_path: Path) -> None:
     assert any("upside down" in said for said in read_origin(_ingest(tmp_path)).said)
 
 
-@pytest.mark.parametrize(("orientation", "told"), [(1, False), (6, False), (3, True)])
-def test_masks_of_photos_taken_upside_down_are_told_to_be_unsure(
+@pytest.mark.parametrize(
+    ("orientation", "upright"),  # of 2 to 4 both have one shape, and are taken for the file's
+    [*((code, False) for code in range(1, 9)), *((code, True) for code in range(5, 9))],
+)
+def test_masks_lie_where_their_photos_pixels_do(
+    tmp_path: Path, orientation: int, upright: bool
+) -> None:
+    """Drawn over the file's pixels, as those who heed no orientation see them, or over the upright photo."""
+    for name in "abc":
+        photo, mask = (tmp_path / f"data/made/{folder}{name}.png" for folder in ("", "masks/"))
+        _photo(photo, orientation=orientation)
+        drawn = Image.new("L", (40, 30), 255)
+        drawn.paste(0, (0, 0, 20, 15))  # the quarter that is bright in the photo
+        if upright:
+            drawn.getexif()[ORIENTATION] = orientation
+            drawn = ImageOps.exif_transpose(drawn)
+        mask.parent.mkdir(exist_ok=True)
+        drawn.save(mask, exif=Image.Exif())
+    images = _ingest(tmp_path)
+    bright = read_image(images / "a.png").min(axis=2) > 0.6
+    assert np.array_equal(~read_keep_mask(images / "masks/a.png"), bright)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "told"),
+    [(1, False), (2, True), (3, True), (4, True), (5, False), (6, False)],
+)
+def test_masks_of_photos_taken_upside_down_or_mirrored_are_told_to_be_unsure(
     tmp_path: Path, orientation: int, told: bool
 ) -> None:
-    """Stored or shown, a mask turned by half has its photo's shape; a quarter would be seen."""
+    """Stored or shown, a mask turned by half or mirrored has its photo's shape; a quarter would be seen."""
     for name in "abc":
         _photo(tmp_path / f"data/made/{name}.jpg", orientation=orientation)
         (tmp_path / "data/made/masks").mkdir(exist_ok=True)
         Image.new("L", (40, 30), 255).save(tmp_path / f"data/made/masks/{name}.png")
     said = read_origin(_ingest(tmp_path)).said
-    assert any("the metadata turns 3 photos" in sentence for sentence in said) == told
+    assert any("the metadata turns or mirrors 3 photos" in sentence for sentence in said) == told
 
 
 def test_a_video_becomes_images(tmp_path: Path) -> None:

@@ -3,8 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.masking.agreement import agreement
 from pipeline.masking.align import aligned
 from pipeline.masking.glass import GlassCamera, PaneGlass, gather, pane_before
+from pipeline.masking.seek import cover
 from pipeline.masking.sweep import agreement_on
 from tests.masking.pane_scene import cameras, wetness
 
@@ -52,6 +54,12 @@ def test_views_that_cover_each_other_stay_and_so_do_those_without_maps() -> None
     assert np.abs(moved[:, :2]).max() < 0.5 * pixel
     assert not aligned(glass, [None, *maps[1:]], 6)[0].any()
     assert not aligned(glass, [*maps[:2], *[None] * 6], 6).any()
+
+
+def test_how_well_views_cover_each_other_is_their_agreement_cell_by_cell() -> None:
+    glass, maps = _scene((0.02, 0.02, 0.0))
+    stack = np.stack([glass.from_view(view, seen) for view, seen in enumerate(maps)])
+    assert cover(glass, maps) == pytest.approx(agreement(stack), abs=5e-3)
 
 
 def test_a_dry_pane_moves_no_camera() -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from pipeline.masking.agreement import tally_of
 from pipeline.masking.glass import (
+    GlassCamera,
     LensGlass,
     PaneGlass,
     gather,
@@ -77,6 +79,30 @@ def test_there_and_back_through_a_lens_with_distortion() -> None:
         assert np.abs(back - own)[inside].max() < 0.05
 
 
+def test_a_wide_lens_shows_nothing_from_beyond_its_fold() -> None:
+    """At 90 degrees across and k1 = -0.12 the picture turns back 59 degrees off the axis."""
+    width, height, focal, k1 = 160, 120, 80.0, -0.12
+    views = []
+    for x in (-0.9, -0.3, 0.3, 0.9):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        views.append(GlassCamera(pose, (focal, focal, width / 2, height / 2, k1), width, height))
+    glass = PaneGlass(pane_before(np.stack([v.cam_from_world for v in views]), 1.0), views)
+    ones = np.ones((height, width), np.float32)
+    rows, columns = np.indices(glass.shape)
+    cells = [glass.low[0] + (columns + 0.5) * glass.cell, glass.low[1] + (rows + 0.5) * glass.cell]
+    folded = 0
+    for view in range(len(views)):
+        x, y, z = np.einsum(
+            "ij,jrc->irc", glass.view_from_glass(view), [*cells, np.ones(glass.shape)]
+        )
+        beyond = 1 + 3 * k1 * (x**2 + y**2) / z**2 <= 0
+        assert not np.isfinite(glass.from_view(view, ones))[beyond].any()
+        folded += int(beyond.sum())
+    votes = sum(np.isfinite(glass.from_view(view, ones)) for view in range(len(views)))
+    assert folded > 1000 and np.array_equal(glass.tally([ones] * len(views)).votes, votes)
+
+
 def test_a_pane_behind_the_cameras_is_refused() -> None:
     views = cameras(2)
     with pytest.raises(ValueError, match="looks away"):
@@ -112,6 +138,16 @@ def test_windows_hold_neighbours_and_stay_inside() -> None:
     assert neighbours(5, 2, 9) == range(5)
 
 
+def test_some_rows_of_the_glass_are_those_of_all() -> None:
+    views = cameras(3, k1=-0.1)
+    glass = PaneGlass(pane_before(np.stack([v.cam_from_world for v in views]), 1.5, 10, 5), views)
+    own = np.random.default_rng(0).random((views[1].height, views[1].width)).astype(np.float32)
+    some = slice(30, 50)
+    for one in (glass, LensGlass(*own.shape)):
+        whole = one.from_view(1, own)
+        assert np.array_equal(one.from_view(1, own, some), whole[some], equal_nan=True)
+
+
 def test_what_is_gathered_a_few_rows_at_a_time_is_what_all_at_once_give() -> None:
     rng = np.random.default_rng(3)
     stack = rng.random((5, 150, 7)).astype(np.float32)
@@ -127,3 +163,17 @@ def test_what_is_gathered_a_few_rows_at_a_time_is_what_all_at_once_give() -> Non
         assert np.array_equal(found, whole, equal_nan=True)
     masks = [stack[view] > 0.5 for view in range(5)]
     assert np.allclose(gather(LensGlass(150, 7), masks, range(5), None)[0], np.mean(masks, axis=0))
+
+
+def test_a_quantile_does_not_hold_every_view_on_the_glass() -> None:
+    views = cameras(40)
+    glass = PaneGlass(pane_before(np.stack([v.cam_from_world for v in views]), 1.5), views)
+    glass.cell /= 5  # many more cells than pixels, as on a pane along which the photos go
+    glass.shape = (5 * glass.shape[0], 5 * glass.shape[1])
+    maps = [wetness(glass.pane_from_world, view) for view in views]
+    glass.from_view(0, maps[0])  # compiled
+    tracemalloc.start()
+    gather(glass, maps, range(40), 0.5)
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < 0.6 * 40 * 4 * glass.shape[0] * glass.shape[1]

@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 
 from pipeline.masking.masks import (
+    automatic_threshold,
+    chosen_threshold,
     dilate,
     drop_mask_of,
     enhanced,
     lens_fixedness,
+    on_the_lens,
     otsu,
-    temporal_mean,
     threshold,
+    together,
     without_specks,
 )
 
@@ -29,8 +32,9 @@ def test_equation_5_by_hand() -> None:
         np.array([[0.9, 0.9, 0.1]], np.float32),
         np.array([[0.0, 0.0, 0.1]], np.float32),
     ]
-    mean = temporal_mean(maps)
-    assert np.allclose(mean, [[0.6, 0.3, 0.1]])
+    count, votes, mean = together(iter(maps), 0.5)
+    assert np.allclose(mean, [[0.6, 0.3, 0.1]]) and mean.dtype == np.float32
+    assert count == 3 and votes.tolist() == [[2, 1, 0]]
     assert enhanced(maps[0], mean, 0.5).tolist() == [[True, False, False]]
     assert enhanced(maps[1], mean, 0.5).tolist() == [[True, True, False]]
     assert enhanced(maps[2], mean, 0.5).tolist() == [[True, False, False]]
@@ -56,7 +60,7 @@ def test_the_mean_alone_forgets_what_one_view_sees() -> None:
 
 def test_a_mean_needs_a_map() -> None:
     with pytest.raises(ValueError, match="no attention maps"):
-        temporal_mean([])
+        together([], 0.5)
 
 
 def test_dilation_grows_a_point_to_a_disc() -> None:
@@ -84,11 +88,34 @@ def test_specks_go_and_drops_stay() -> None:
 def test_drops_that_never_move_agree_and_independent_ones_do_not() -> None:
     rng = np.random.default_rng(0)
     still = (rng.random((60, 80)) > 0.8).astype(np.float32)
-    assert lens_fixedness([still] * 5, 0.5) == pytest.approx(1.0)
+    assert lens_fixedness(together([still] * 5, 0.5)) == pytest.approx(1.0)
     moving = [(rng.random((60, 80)) > 0.8).astype(np.float32) for _ in range(5)]
-    assert abs(lens_fixedness(moving, 0.5)) < 0.02
+    assert abs(lens_fixedness(together(moving, 0.5))) < 0.02
 
 
 def test_nothing_marked_is_not_lens_fixed() -> None:
-    assert lens_fixedness([np.zeros((4, 4), np.float32)] * 3, 0.5) == 0.0
-    assert lens_fixedness([np.ones((4, 4), np.float32)] * 3, 0.5) == 0.0
+    assert lens_fixedness(together([np.zeros((4, 4), np.float32)] * 3, 0.5)) == 0.0
+    assert lens_fixedness(together([np.ones((4, 4), np.float32)] * 3, 0.5)) == 0.0
+
+
+def test_whether_drops_are_on_the_lens_is_what_the_maps_say_or_the_user() -> None:
+    # Of two pixels each map marks one: chance would have half of the pairs agree (p = 1/2).
+    left, right = np.array([[0.9, 0.1]], np.float32), np.array([[0.1, 0.9]], np.float32)
+    still, moving = together([left] * 3, 0.5), together([left, right, left], 0.5)
+    # Of six ordered pairs of marks two agree: (1/3 - 1/2) / (1 - 1/2).
+    assert lens_fixedness(moving) == pytest.approx(-1 / 3)
+    assert on_the_lens(still, "auto", 0.3) == (True, "the maps agree to 1.00 >= 0.3 per pixel")
+    assert on_the_lens(still, "auto", 1.0)[0]  # as much as is asked for is enough
+    assert on_the_lens(moving, "auto", 0.3) == (False, "the maps agree to -0.33 < 0.3 per pixel")
+    assert on_the_lens(moving, "on", 0.3) == (True, "masks.temporal_mean is on")
+    assert on_the_lens(still, "off", 0.3) == (False, "masks.temporal_mean is off")
+
+
+def test_the_threshold_is_the_users_or_parts_the_values_of_all_maps() -> None:
+    rng = np.random.default_rng(0)
+    maps = [rng.beta(0.3, 0.9, (30, 40)).astype(np.float16).astype(np.float32) for _ in range(5)]
+    assert chosen_threshold(iter(maps), 0.25) == (0.25, "masks.threshold")
+    t, why = chosen_threshold(iter(maps), "auto")
+    assert why.startswith("auto") and t == automatic_threshold(maps)
+    # One map after the other, as all values at once.
+    assert t == round(float(np.clip(otsu(np.stack(maps).ravel()), 0.2, 0.6)), 2)

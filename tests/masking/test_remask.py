@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.masking.glass import LensGlass
+from pipeline.masking.glass import EVERY, LensGlass
 from pipeline.masking.masks import automatic_threshold, otsu
 from pipeline.masking.remask import SPILL, opened, redraw, without_holes, without_spill
 from pipeline.masking.residual import exposure, residual
@@ -232,8 +232,8 @@ class _CoarseGlass:
 
     shape = (16, 16)
 
-    def from_view(self, view: int, values: np.ndarray) -> np.ndarray:
-        return cv2.resize(values.astype(np.float32), self.shape, interpolation=cv2.INTER_AREA)
+    def from_view(self, view: int, values: np.ndarray, rows: slice = EVERY) -> np.ndarray:
+        return cv2.resize(values.astype(np.float32), self.shape, interpolation=cv2.INTER_AREA)[rows]
 
     def to_view(self, view: int, values: np.ndarray) -> np.ndarray:
         return cv2.resize(values.astype(np.float32), (64, 64), interpolation=cv2.INTER_LINEAR)

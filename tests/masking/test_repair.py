@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Literal
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.masking.account import account
 from pipeline.masking.glass import GlassCamera, pane_before
 from pipeline.masking.loop import repair
 from tests.masking.pane_scene import cameras, wetness
@@ -47,6 +49,11 @@ def test_drops_on_a_pane_are_found_from_what_the_scene_says() -> None:
     assert done.rounds[-1].found.mode == "pane"
     assert len(done.rounds) > 1
     assert _iou(done.rounds[-1].drop_masks, wet) > max(0.8, _iou(drawn, wet))
+    # The attention showed the pane: how the residuals agree on the lens was not looked at.
+    told = account(done, [str(view) for view in range(len(views))])["rounds"]
+    assert told["0"]["lens_agreement"] < 0.3 and told["1"]["lens_agreement"] is None
+    assert told["1"]["pane_agreement"] > 0.3
+    json.dumps(told, allow_nan=False)
 
 
 def test_drops_on_the_lens_and_no_drops() -> None:
@@ -91,6 +98,27 @@ def test_a_scene_that_is_wrong_everywhere_does_not_redraw_good_masks() -> None:
     # Where no attention was asked, the residual is all there is, and it is followed.
     alone = repair(look, wet, views, drawn, 4.0, rounds=1, use_attention=False, contrast=1.0)
     assert len(alone.rounds) == 2
+
+
+@pytest.mark.parametrize(("standing", "farthest"), [(True, 4.0), (False, 0.2)])
+def test_a_pane_that_nobody_can_find_is_not_taken_for_the_lens(
+    standing: bool, farthest: float
+) -> None:
+    """From one place, or from places too far apart for what they see, no distance of a pane can be told."""
+    views, pane = _views()
+    views = [views[0]] * 6 if standing else views
+    wet = [wetness(pane, views[0])] * len(views)
+    drawn = [one > 0.5 for one in wet]
+    fits: list[object] = []
+
+    def look(drop_masks: Sequence[np.ndarray], found: object) -> list[np.ndarray | None]:
+        fits.append(found)
+        return list(wet)
+
+    done = repair(look, wet, views, drawn, farthest, rounds=2, mode="pane")
+    assert [one.found.mode for one in done.rounds] == ["none"] and not fits
+    assert done.ended.startswith("refine.mode is pane, but no plane is within reach")
+    assert all(np.array_equal(a, b) for a, b in zip(done.rounds[0].drop_masks, drawn, strict=True))
 
 
 @pytest.mark.parametrize("mode", ["pane", "lens"])

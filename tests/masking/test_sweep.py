@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.masking import seek
 from pipeline.masking.agreement import agreement
-from pipeline.masking.sweep import Found, agreement_on, find_glass
+from pipeline.masking.sweep import Found, agreement_on, find_glass, prepared
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -105,3 +105,15 @@ def test_some_views_agree_on_the_pane_of_all_wherever_their_own_mean_looks() -> 
     with pytest.raises(ValueError, match="looks away"):
         PaneGlass(pane, views[3:])
     assert np.isfinite(agreement_on(glass, maps))
+
+
+def test_a_broad_gradient_is_taken_out_of_a_map_that_is_made_smaller() -> None:
+    """A paraboloid stays one when areas are averaged; what is unknown of it changes nothing."""
+    y, x = np.mgrid[-1:1:150j, -1:1:200j]
+    values = (0.3 + 0.2 * x - 0.1 * y + 0.4 * x * y - 0.3 * x**2 + 0.2 * y**2).astype(np.float32)
+    values[30:60, 80:120] = np.nan
+    camera = GlassCamera(np.eye(4), (100, 100, 100, 75, 0), 200, 150)
+    (small,), (smaller,) = prepared([values], [camera], 50)
+    assert small.shape == (smaller.height, smaller.width) == (38, 50)
+    # Ten cells by eight are wholly unknown; those at the rim count as long as half of them is known.
+    assert 60 <= np.isnan(small).sum() <= 80 and np.nanmax(np.abs(small)) < 5e-3

@@ -64,6 +64,8 @@ def test_the_window_is_as_wide_as_photos_agree() -> None:
     falling = np.array([0.8, 0.78, 0.75, 0.73, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2])
     assert chosen_window(falling) == 5
     assert chosen_window(falling - 0.03) == 5  # 0.693 is missed from 5 apart on as well
+    # Photos 4 apart agree less: two to either side of the middle do not; the window's ends may.
+    assert chosen_window(np.array([0.8, 0.78, 0.75, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2])) == 5
     assert chosen_window(np.array([0.8] + 9 * [0.3])) == 3
     assert chosen_window(np.full(10, 0.8)) == 0
     assert chosen_window(0.8 + 0.05 * np.cos(np.arange(10.0))) == 0
