@@ -7,9 +7,7 @@ threads there are, only the time does.
 
 from __future__ import annotations
 
-import ctypes
 import math
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -33,7 +31,7 @@ from pipeline.field.steppers import (
     steppers_of,
     totals,
 )
-from pipeline.io.memory import refuse_without_room
+from pipeline.io.memory import keep_memory, refuse_without_room
 
 T = TypeVar("T")
 
@@ -149,7 +147,7 @@ def _on_cpu(
     pool: Executor | None,
 ) -> Take:
     """What takes a step on a CPU."""
-    _keep_memory()
+    keep_memory()
 
     def take(step: int) -> Tensor:
         batch = buffer.batch(step, batch_rays)
@@ -206,18 +204,6 @@ def _map(pool: Executor | None, function: Callable[[int], T], count: int) -> lis
     if pool is None:
         return [function(i) for i in range(count)]
     return list(pool.map(function, range(count)))
-
-
-def _keep_memory() -> None:
-    """What is freed stays with this process: a step takes and frees some 100 MB.
-
-    By default glibc gives large pieces back, and the kernel clears every page when it is next touched, which
-    took a seventh of a step (``mallopt(3)``). Other libraries of C are left as they are.
-    """
-    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        trim_threshold, mmap_max = -1, -4  # malloc.h
-        libc.mallopt(mmap_max, 0)
-        libc.mallopt(trim_threshold, 2**31 - 1)
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from pipeline.geometry.spaces import Space
 
 NOTHING = np.empty((0, 0), np.float32)
 NO_SHAKE = np.empty((0, 0, 0), np.float32)
+BLOCK = 2048  # points: what the network makes of as many stays in the nearest caches
 
 
 def walk(
@@ -253,22 +254,47 @@ def proposal_loss(edges: Tensor, weights: Tensor, proposed: Tensor, eps: float =
 
 class _Network(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, half: bool, *weights: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, half: bool, learns: bool, *weights: Tensor) -> Tensor:
         kind = torch.bfloat16 if half else x.dtype
         x, w_in, b_in, w_out, b_out, w_skip = (part.to(kind) for part in (x, *weights))
-        hidden = torch.addmm(b_in, x, w_in.t()).relu_()
+        blocks = _blocks(x)
+        hidden = x.new_empty(x.shape[0] if learns else blocks[0].stop, w_in.shape[0])
+        out = x.new_empty(x.shape[0], w_out.shape[0])
+        for rows in blocks:
+            inside = hidden[rows] if learns else hidden[: rows.stop - rows.start]
+            torch.addmm(b_in, x[rows], w_in.t(), out=inside).relu_()
+            torch.addmm(b_out, inside, w_out.t(), out=out[rows]).addmm_(x[rows], w_skip.t())
         ctx.save_for_backward(x, hidden, w_in, w_out, w_skip)
-        return torch.addmm(b_out, hidden, w_out.t()).addmm_(x, w_skip.t()).float()
+        return out.float()
 
     @staticmethod
     def backward(ctx: Any, g: Tensor) -> Any:
         x, hidden, w_in, w_out, w_skip = ctx.saved_tensors
         low = g.to(x.dtype)
-        g_hidden = torch.ops.aten.threshold_backward(low @ w_out, hidden, 0)
-        g_x = (g_hidden @ w_in).addmm_(low, w_skip)
+        g_hidden, g_x = torch.empty_like(hidden), torch.empty_like(x)
+        for rows in _blocks(x):
+            inside = torch.mm(low[rows], w_out, out=g_hidden[rows])
+            torch.ops.aten.threshold_backward.grad_input(inside, hidden[rows], 0, grad_input=inside)
+            torch.mm(inside, w_in, out=g_x[rows]).addmm_(low[rows], w_skip)
         g_in, g_out, g_skip = g_hidden.t() @ x, low.t() @ hidden, low.t() @ x
         sums = (low.new_ones(1, low.shape[0]) @ g_hidden)[0].float(), g.sum(0)
-        return g_x.float(), None, g_in.float(), sums[0], g_out.float(), sums[1], g_skip.float()
+        return (
+            g_x.float(),
+            None,
+            None,
+            g_in.float(),
+            sums[0],
+            g_out.float(),
+            sums[1],
+            g_skip.float(),
+        )
+
+
+def _blocks(x: Tensor) -> list[slice]:
+    """Runs of points that are taken at a time; of bfloat16 numbers, which were not measured so, all at once."""
+    count = x.shape[0]
+    size = BLOCK if x.dtype == torch.float32 else max(count, 1)
+    return [slice(first, min(first + size, count)) for first in range(0, max(count, 1), size)]
 
 
 def shape_network(x: Tensor, half: bool, *weights: Tensor) -> Tensor:
@@ -278,5 +304,5 @@ def shape_network(x: Tensor, half: bool, *weights: Tensor) -> Tensor:
     ``half`` the products are those of bfloat16 numbers, which newer processors multiply several
     times faster.
     """
-    out: Tensor = _Network.apply(x, half, *weights)
+    out: Tensor = _Network.apply(x, half, torch.is_grad_enabled(), *weights)
     return out

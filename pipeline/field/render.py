@@ -9,6 +9,7 @@ import torch
 
 from pipeline.field.base import Field, Rays
 from pipeline.geometry.rays import pixel_rays
+from pipeline.io.memory import keep_memory
 
 CHUNK = 2048  # rays: what a core keeps in its cache; larger chunks are slower
 CPU_SAMPLES = 2**16  # at a time on each core: the paper's field takes 2 kB for each
@@ -52,6 +53,7 @@ def render_view(
     suits the device). The same bytes for the same chunk, whatever runs beside it.
     """
     width, height = size
+    keep_memory()
     if chunk is None:
         samples = field.samples_per_ray()
         chunk = max(1, CUDA_SAMPLES // samples)
