@@ -13,7 +13,7 @@ from pipeline.field.model import build_around
 from pipeline.field.store import Checkpoint, fit_key, save_field
 from pipeline.io.atomic import publish_dir, write_csv
 from pipeline.io.maps import read_map
-from pipeline.io.posed import read_posed_images
+from pipeline.io.posed import HELD_BYTES, read_posed_images
 from pipeline.io.transforms import read_transforms
 from pipeline.parallel import cores
 from pipeline.stage import Job, Section, run
@@ -59,12 +59,14 @@ def main(job: Job, params: Params) -> str:
     views = read_transforms(job.paths.poses / "transforms.json")
     near, far = depth_bounds(views.values(), params.near_factor, params.far_factor)
     keep_masks = job.paths.refine if params.use_masks else None
-    images = read_posed_images(job.paths.images, keep_masks, views)
+    held = HELD_BYTES + 5 * params.soft_masks  # a soft mask, as read and in the buffer
+    images = read_posed_images(job.paths.images, keep_masks, views, held)
     soft = None  # equation 4's M of kept pixels
     if params.soft_masks:
         files = {image.record: job.paths.attention / f"{image.record.stem}.exr" for image in images}
         soft = {record.name: read_map(files[record], size=record.size) for record in files}
     photos = photos_to_fit(images, near, far, soft)
+    del images  # the held-out ones
     settings = params.model_dump(include=SETTINGS)
     cameras = list(views.values())
     field = build_around(params.model, cameras, near, far, device=job.device, **settings)
@@ -73,7 +75,7 @@ def main(job: Job, params: Params) -> str:
     key = fit_key(field, photos, params.model_dump(), job.device)
     checkpoint = Checkpoint(job.paths.work("nerf") / "checkpoint.safetensors", key)
     names = [photo.name for photo in photos]
-    del images, photos, soft  # their pixels lie in the buffer, at a quarter of the size
+    del photos, soft  # their pixels lie in the buffer, at a quarter of the size
     steps, record = _fit(job, params, field, buffer, checkpoint)
     gains = None if record.gains is None else record.gains.tolist()
     about = {"steps": steps, "rays": buffer.count, "photos": names, "gains": gains}

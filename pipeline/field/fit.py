@@ -130,9 +130,8 @@ def refuse_large(model: nn.Module, device: str) -> None:
 def _row(done: int, losses: list[Tensor]) -> tuple[int, float, float]:
     """Step, mean loss and PSNR of the steps since the last row; UserError when they are not finite."""
     loss, photometric = torch.stack(losses).mean(0).tolist()
-    _check_finite(
-        loss + photometric, done - 1
-    )  # trimmed, errors that are no numbers leave the loss 0
+    # Where rays are trimmed, errors that are no numbers leave the loss 0.
+    _check_finite(loss + photometric, done - 1)
     return done, loss, -10.0 * math.log10(max(photometric, 1e-12))
 
 

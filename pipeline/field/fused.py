@@ -278,16 +278,8 @@ class _Network(torch.autograd.Function):
             torch.mm(inside, w_in, out=g_x[rows]).addmm_(low[rows], w_skip)
         g_in, g_out, g_skip = g_hidden.t() @ x, low.t() @ hidden, low.t() @ x
         sums = (low.new_ones(1, low.shape[0]) @ g_hidden)[0].float(), g.sum(0)
-        return (
-            g_x.float(),
-            None,
-            None,
-            g_in.float(),
-            sums[0],
-            g_out.float(),
-            sums[1],
-            g_skip.float(),
-        )
+        weights = g_in.float(), sums[0], g_out.float(), sums[1], g_skip.float()
+        return g_x.float(), None, None, *weights
 
 
 def _blocks(x: Tensor) -> list[slice]:

@@ -12,7 +12,7 @@ import torch
 from pipeline.errors import UserError
 from pipeline.field.grid_field import GridConfig, GridField
 from pipeline.field.paper_field import PaperConfig, PaperField
-from pipeline.geometry.rays import UNDISTORT_STEPS
+from pipeline.geometry.rays import FOLDS, UNDISTORT_STEPS
 from pipeline.geometry.spaces import Space, fit_space
 from pipeline.io.processor import multiplies_bfloat16
 
@@ -25,7 +25,6 @@ CONTRACTED_BINS = 64
 CONTRACTED_DECAY = 3.0
 # k1 r^2 of a corner; with less, sides reach less than a two hundredth beyond the corners.
 BULGES = 0.02
-FOLDS = 2.0 / 3.0  # where 1 + k1 r^2 is less, the picture of a lens with k1 < 0 folds back
 
 
 class Camera(Protocol):

@@ -13,6 +13,9 @@ UNDISTORT_STEPS = 24
 # -k1 r^2 of the distorted radius r from which 24 steps are off by more than 0.03 px; at 4/27 a lens with k1 < 0
 # folds back, and no ray leads to what lies beyond.
 MOST_FOLDED = 0.145
+FOLDS = (
+    2.0 / 3.0
+)  # the same of the undistorted radius: where 1 + k1 r^2 is less, the picture has folded back
 
 
 def undistort(

@@ -127,7 +127,7 @@ def _clean(scene: StraightScene) -> None:
         )
     for index, image in enumerate(
         scene.images
-    ):  # one at a time: both forms of all would fill the memory
+    ):  # one at a time: both forms of all take twice the room
         size = (image.view.width, image.view.height)
         rgb = read_image(scene.paths.views / "composite" / image.view.name, "render", size)
         keep_mask = image.keep_mask | scene.seen(image.view)

@@ -17,14 +17,13 @@ import torch
 
 from pipeline.geometry.compiled import compiled
 from pipeline.geometry.poses import invert
-from pipeline.geometry.rays import pixel_rays
+from pipeline.geometry.rays import FOLDS, pixel_rays
 from pipeline.geometry.spaces import mean_camera
 from pipeline.masking.agreement import Tally
 
 MAX_CELLS = 1_000_000
 BAND = 64  # rows of cells whose quantile over the views is taken at a time
 EVERY = slice(None)  # row
-FOLDS = 2.0 / 3.0  # where 1 + k1 r^2 is less, the picture of a lens with k1 < 0 folds back
 
 
 class GlassCamera(NamedTuple):

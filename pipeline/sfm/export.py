@@ -42,9 +42,7 @@ def write_straight(
     out = pycolmap.Reconstruction()
     cameras = _add_cameras(out, straight)
     known = {image.name: image for image in model.images.values()}
-    moved: dict[
-        tuple[int, int], tuple[int, int]
-    ] = {}  # (image, keypoint) in `out`, by those in `model`
+    moved: dict[tuple[int, int], tuple[int, int]] = {}  # image and keypoint in `out`, by `model`'s
     for number, name in enumerate(sorted(straight), start=1):
         view, image = straight[name], known.get(name)
         keypoints = np.empty((0, 2))
